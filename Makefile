@@ -1,0 +1,52 @@
+# One-command entry points. Everything runs in .venv, which is made on first use and remade when the pins change.
+# The same steps as plain commands, for Windows too, are in the README.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+
+.DEFAULT_GOAL := help
+.PHONY: help install demo test test-all lint format lab labs train bench mutation-test clean
+
+help:  ## Show this list
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-15s %s\n", $$1, $$2}'
+
+$(STAMP): pyproject.toml constraints.txt
+	$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11) and 'robotbrain needs Python 3.11 or newer; set PYTHON=...')"
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[dev]"
+	@touch $(STAMP)
+
+install: $(STAMP)  ## Make .venv and install the kit into it
+
+demo: $(STAMP)  ## The main job: make the labs, grade the sample class, drive the robot, show one page
+	$(BIN)/robotbrain demo
+
+test: $(STAMP)  ## Run the tests
+	$(BIN)/python -m pytest
+
+lint: $(STAMP)  ## Check style and types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/robotbrain notebooks check course labs solutions
+
+format: $(STAMP)  ## Put code and notebooks into canonical form
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+	$(BIN)/robotbrain notebooks fix course labs solutions
+
+lab: $(STAMP)  ## Open JupyterLab on the course
+	$(BIN)/robotbrain lab
+
+labs: $(STAMP)  ## Generate labs/ from solutions/
+	$(BIN)/robotbrain generate lab_integration
+
+train: $(STAMP)  ## Train the perception network again (a few minutes) and report its figure
+	$(BIN)/robotbrain train segmentation
+
+bench: $(STAMP)  ## Run the benchmarks; each prints one table
+	for script in benchmarks/*.py; do $(BIN)/python $$script; done
+
+clean:  ## Remove .venv, caches and generated pages
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache demo build dist

@@ -1,0 +1,92 @@
+"""Running a network: ONNX Runtime on this machine, with the latency it would have on the profile's Jetson."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robotbrain.errors import InputError
+from robotbrain.jetson.profiles import JetsonProfile
+
+
+class OnnxEngine:
+    """An inference engine over an ONNX file with one float32 image input and one output.
+
+    The numbers come from ONNX Runtime here; ``latency_ns`` is what the profile says one inference takes there.
+
+    Args:
+        model: path of the ONNX file.
+        profile: the Jetson it is deployed to; None means an inference takes no simulated time.
+    """
+
+    def __init__(self, model: str | Path, profile: JetsonProfile | None = None) -> None:
+        import onnxruntime
+
+        path = Path(model)
+        if not path.is_file():
+            raise InputError(
+                "model",
+                given=str(path),
+                expected="the path of an ONNX file",
+                fix="Train it with `robotbrain train segmentation`, or check the path.",
+            )
+        options = onnxruntime.SessionOptions()
+        # One thread: the nets are small, and results must not depend on the machine's core count.
+        options.intra_op_num_threads = 1
+        options.inter_op_num_threads = 1
+        options.log_severity_level = 3
+        try:
+            self._session: Any = onnxruntime.InferenceSession(
+                path.read_bytes(), options, providers=["CPUExecutionProvider"]
+            )
+        except Exception as error:  # ONNX Runtime raises a family of its own, without a common public base
+            raise InputError(
+                "model",
+                given=str(path),
+                expected="a valid ONNX file",
+                fix=f"ONNX Runtime says: {str(error).splitlines()[0][:200]}",
+            ) from error
+        self.profile = profile
+        self._input = self._session.get_inputs()[0]
+        self._output: str = self._session.get_outputs()[0].name
+
+    @property
+    def input_shape(self) -> tuple[int | str | None, ...]:
+        """Shape of the input; names stand for axes of any length."""
+        return tuple(self._input.shape)
+
+    @property
+    def latency_ns(self) -> int:
+        """Time of one inference on the profile's module, ns."""
+        return 0 if self.profile is None else round(self.profile.segmentation_ms * 1e6)
+
+    def infer(self, batch: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the network's output for one input.
+
+        Raises:
+            InputError: for another dtype or shape than the network takes, or values that are not finite.
+        """
+        wanted = self.input_shape
+        given = np.asarray(batch)
+        fits = given.ndim == len(wanted) and all(
+            not isinstance(size, int) or size == actual for size, actual in zip(wanted, given.shape, strict=False)
+        )
+        if given.dtype != np.float32 or not fits:
+            raise InputError(
+                "network input",
+                given=f"{given.dtype} {given.shape}",
+                expected=f"float32 {wanted}",
+                fix="Scale to float32, put channels before rows and columns, and add a batch axis.",
+            )
+        if not np.isfinite(given).all():
+            raise InputError(
+                "network input",
+                given="NaN or infinity",
+                expected="finite values",
+                fix="Check the preprocessing.",
+            )
+        result: NDArray[np.float32] = self._session.run([self._output], {self._input.name: given})[0]
+        return result
