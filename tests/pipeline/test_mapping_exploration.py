@@ -48,11 +48,19 @@ def test_the_map_does_not_depend_on_the_robots_heading() -> None:
 
 def test_no_return_clears_but_marks_nothing_and_nan_is_ignored() -> None:
     mapper = OccupancyMapper(FRAME)
-    mapper.add_scan((0, 0, 0), np.array([np.inf, np.nan]), np.array([0.0, np.pi / 2]))
+    mapper.add_scan((0, 0, 0), np.array([np.inf, np.inf, np.nan]), np.array([0.0, 0.02, np.pi / 2]))
     grid = mapper.occupancy()
     assert at(grid, 3.0, 0.01) < 50 and at(grid, 3.0, 0.01) >= 0
     assert (grid >= 65).sum() == 0
     assert at(grid, 0.01, 2.0) == -1
+
+
+def test_a_lone_silent_beam_between_returns_is_a_lost_echo() -> None:
+    mapper = OccupancyMapper(FRAME)
+    ranges = square_room(2.0)
+    ranges[180] = np.inf
+    mapper.add_scan((0, 0, 0), ranges, ANGLES)
+    assert at(mapper.occupancy(), 3.0, 0.01) == -1
 
 
 def test_lidar_free_space_does_not_erase_a_low_box_seen_by_the_camera() -> None:

@@ -146,7 +146,7 @@ class PathTracker:
             return self._back_up(near)
         position = np.asarray(pose[:2])
         remaining = float(np.linalg.norm(path[-1] - position))
-        if remaining < p.arrive or (len(path) == 1 and remaining < 3 * p.arrive):
+        if remaining < p.arrive or (final_yaw is not None and remaining < 3 * p.arrive):
             self._blocked_since = None
             return self._turn_to(pose, final_yaw)
         target = transform(inverse(pose), lookahead_point(path, position, p.lookahead))

@@ -217,9 +217,8 @@ class ScanMatcher:
         rms = float(np.sqrt((residual**2).mean()))
         # A floor under the covariance: neighbouring beams share their errors (normals, discretisation).
         scale = max(p.range_noise, rms) ** 2 * 4
-        covariance: NDArray[np.float64] = scale * np.linalg.inv(hessian + 1e-3 * np.eye(3)) + np.diag(
-            [1e-5, 1e-5, 1e-6]
-        )
+        inverted = np.linalg.inv(hessian + 1e-3 * np.eye(3))
+        covariance = np.asarray(scale * inverted + np.diag([1e-5, 1e-5, 1e-6]), dtype=np.float64)
         return ScanMatch((float(pose[0]), float(pose[1]), wrap(float(pose[2]))), covariance, rms)
 
     def keep(self, points: NDArray[np.float64], pose: Pose) -> bool:

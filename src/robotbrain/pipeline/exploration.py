@@ -156,6 +156,12 @@ class MarkerTracker:
         nearest.information = total
         nearest.hits += 1
 
+    def discard(self) -> None:
+        """Forget the track that :meth:`estimate` returns: it cannot be the marker, for it cannot be reached."""
+        best = max(self._tracks, key=lambda t: t.hits, default=None)
+        if best is not None:
+            self._tracks.remove(best)
+
     def estimate(self) -> tuple[float, float] | None:
         """Return the position of the track seen most often, x, y in m; None until one is confirmed."""
         best = max(self._tracks, key=lambda t: t.hits, default=None)

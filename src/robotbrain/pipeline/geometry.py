@@ -87,6 +87,10 @@ class PoseBuffer:
         """Return the newest pose, or None."""
         return self._poses[-1] if self._poses else None
 
+    def latest_stamp(self) -> int | None:
+        """Return the stamp of the newest pose in ns, or None."""
+        return self._stamps[-1] if self._stamps else None
+
     def at(self, stamp_ns: int) -> Pose | None:
         """Return the pose at ``stamp_ns``, linearly interpolated; None where the buffer does not reach."""
         index = bisect_left(self._stamps, stamp_ns)

@@ -60,10 +60,14 @@ class OccupancyMapper:
 
         Args:
             pose: of the lidar in the map frame when the scan was taken.
-            ranges: (N,) m; inf where nothing returned, NaN where the beam is invalid.
+            ranges: (N,) m, all around; inf where nothing returned, NaN where the beam is invalid. A lone inf between two
+                returns is taken for a lost echo, not for open space.
             angles: (N,) rad, counter-clockwise from the lidar's x axis.
         """
         step = self.frame.resolution / 2
+        silent = np.isinf(ranges)
+        lost = silent & ~np.roll(silent, 1) & ~np.roll(silent, -1)
+        ranges = np.where(lost, np.nan, ranges)
         reach = np.where(np.isinf(ranges), self.params.lidar_range, ranges)
         valid = np.isfinite(reach)
         reach, angles = np.minimum(reach[valid], self.params.lidar_range), angles[valid]

@@ -357,10 +357,9 @@ def plan_path(
     found = astar_search(cost, begin, end)
     if found.path is None:
         return PlanResult(None, found.expanded)
-    points = frame.to_points(smooth(found.path, cost))
-    points[0] = start
-    if end == goal_cell:
-        points[-1] = goal
+    inner = frame.to_points(smooth(found.path, cost))[1:-1]
+    last = np.asarray(goal, dtype=float) if end == goal_cell else frame.to_points(end)
+    points = np.concatenate([[start], inner, [last]])
     return PlanResult(resample(points, 2 * frame.resolution), found.expanded)
 
 

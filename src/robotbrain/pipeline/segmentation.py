@@ -22,6 +22,9 @@ MEAN = (0.45, 0.45, 0.45)
 STD = (0.25, 0.25, 0.25)
 """Per-channel normalisation the network was trained with, in units of full scale."""
 
+MAT_BELOW, SIGN_ABOVE = 0.08, 0.6
+"""The marker is a mat on the floor and a sign that hangs above; what looks like it between these heights, m, is not."""
+
 SIGN_DEPTH = 0.2
 """Half the depth of the hanging sign, m: its axis lies this far behind the face that the camera sees."""
 
@@ -59,7 +62,7 @@ def preprocess(image: ArrayLike) -> NDArray[np.float32]:
             "image",
             given=f"{pixels.dtype} {pixels.shape}",
             expected="uint8 of shape (height, width, 3), RGB",
-            fix="Decode the sensor_msgs/Image with robotbrain.ros.conversions.image_to_array first.",
+            fix="Decode the sensor_msgs/Image with robotbrain.ros.conversions.image_to_numpy first.",
         )
     return normalise(pixels[None])
 
@@ -108,20 +111,22 @@ def locate_marker(
 ) -> tuple[float, float] | None:
     """Return where the marker stands, x, y in the base frame in m; None if it is not seen well enough.
 
-    The mat on the floor shows its centre best when near; the sign above shows the face towards the camera, so its points
-    are moved back by half the sign's depth along their bearing. The median shrugs off a few wrong pixels.
+    The mat on the floor shows its centre best when near; the sign above shows the face towards the camera, so its
+    points are moved back by half the sign's depth along their bearing. The median shrugs off a few wrong pixels.
 
     Args:
         mask: (H, W) class ids.
         points: (H, W, 3) from :func:`back_project`.
         min_pixels: fewer marker pixels than this with a depth count as not seen.
     """
-    seen = (mask == MARKER) & np.isfinite(points[..., 0])
+    height = points[..., 2]
+    on_mat, on_sign = height < MAT_BELOW, height > SIGN_ABOVE  # false where there is no depth
+    seen = (mask == MARKER) & (on_mat | on_sign)
     if int(seen.sum()) < min_pixels:
         return None
     xyz = points[seen]
     flat = xyz[:, :2].copy()
-    sign = xyz[:, 2] > 0.4
+    sign = xyz[:, 2] > SIGN_ABOVE
     distance = np.linalg.norm(flat[sign], axis=1, keepdims=True)
     flat[sign] *= 1.0 + SIGN_DEPTH / np.maximum(distance, 0.1)
     x, y = np.median(flat, axis=0)

@@ -42,10 +42,10 @@ class TrainConfig:
     """
 
     seed: int = 0
-    worlds: int = 400
+    worlds: int = 300
     images_per_world: int = 12
     held_out_worlds: int = 100
-    epochs: int = 12
+    epochs: int = 6
     batch_size: int = 32
     learning_rate: float = 6e-3
     width: int = 8
@@ -115,15 +115,15 @@ def train(config: TrainConfig, output: Path, *, progress: bool = True) -> dict[s
     from torch import nn
     from tqdm.auto import tqdm
 
-    from robotbrain.sim import render_dataset
+    from robotbrain.sim.dataset import render_dataset
 
     if output.suffix != ".onnx":
         raise InputError("output", given=str(output), expected="a path ending in .onnx", fix="Add the suffix.")
     begin = time.perf_counter()
     torch.manual_seed(config.seed)
     rng = np.random.default_rng(config.seed)
-    images, labels = render_dataset(
-        range(config.seed, config.seed + config.worlds), config.images_per_world, seed=config.seed
+    images, labels, _ = render_dataset(
+        range(config.seed, config.seed + config.worlds), config.images_per_world
     )
     rendered = time.perf_counter() - begin
     inputs, targets = torch.from_numpy(normalise(images)), torch.from_numpy(labels.astype(np.int64))
@@ -149,10 +149,10 @@ def train(config: TrainConfig, output: Path, *, progress: bool = True) -> dict[s
                 schedule.step()
                 bar.update()
                 if k % 20 == 0:
-                    bar.set_postfix(loss=f"{float(loss):.3f}")
+                    bar.set_postfix(loss=f"{loss.item():.3f}")
     export(network, output)
-    held_images, held_labels = render_dataset(
-        range(HELD_OUT_SEED, HELD_OUT_SEED + config.held_out_worlds), 4, seed=HELD_OUT_SEED
+    held_images, held_labels, _ = render_dataset(
+        range(HELD_OUT_SEED, HELD_OUT_SEED + config.held_out_worlds), 4
     )
     session = onnxruntime.InferenceSession(str(output), providers=["CPUExecutionProvider"])
     iou = evaluate(session, held_images, held_labels)

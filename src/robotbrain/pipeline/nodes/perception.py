@@ -1,0 +1,90 @@
+"""Perception node: images in, labelled points and the marker's position out."""
+
+from __future__ import annotations
+
+import numpy as np
+from geometry_msgs.msg import PointStamped
+from numpy.typing import NDArray
+from rclpy.node import Node
+from rclpy.qos import qos_profile_sensor_data
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+
+from robotbrain.jetson.engine import OnnxEngine
+from robotbrain.pipeline.segmentation import (
+    CameraModel,
+    back_project,
+    decode,
+    ground_points,
+    locate_marker,
+    preprocess,
+)
+from robotbrain.ros import charge
+from robotbrain.ros.conversions import numpy_to_image, image_to_numpy, points_to_cloud
+
+FLOOR_LABEL, OBSTACLE_LABEL = 0.0, 1.0
+"""Third coordinate of a published point: 0 on the floor, 1 on an obstacle (the points themselves are flat)."""
+
+
+class PerceptionNode(Node):
+    """Runs the segmentation network on every image.
+
+    Subscribes ``camera/image``, ``camera/depth``, ``camera/camera_info``; publishes ``perception/segmentation``
+    (mono8 class ids), ``perception/marker`` (PointStamped in base_link, only when seen) and ``perception/points``
+    (PointCloud2 in base_link; z is the label). Every output carries the stamp of the image it came from.
+
+    Args:
+        engine: runs the network; its latency is charged to simulated time.
+        mounting: (x, y, z, pitch) of the camera on the base, m and rad.
+    """
+
+    def __init__(self, engine: OnnxEngine, mounting: tuple[float, float, float, float]) -> None:
+        super().__init__("perception")
+        self._engine = engine
+        self._mounting = mounting
+        self._camera: CameraModel | None = None
+        self._depth: Image | None = None
+        self._mask_pub = self.create_publisher(Image, "perception/segmentation", 10)
+        self._marker_pub = self.create_publisher(PointStamped, "perception/marker", 10)
+        self._points_pub = self.create_publisher(PointCloud2, "perception/points", 10)
+        self.create_subscription(CameraInfo, "camera/camera_info", self._on_info, 10)
+        self.create_subscription(Image, "camera/depth", self._on_depth, qos_profile_sensor_data)
+        self.create_subscription(Image, "camera/image", self._on_image, 1)
+
+    def _on_info(self, msg: CameraInfo) -> None:
+        x, y, z, pitch = self._mounting
+        self._camera = CameraModel(
+            float(msg.k[0]), float(msg.k[4]), float(msg.k[2]), float(msg.k[5]), (x, y, z), pitch
+        )
+
+    def _on_depth(self, msg: Image) -> None:
+        self._depth = msg
+
+    def _on_image(self, msg: Image) -> None:
+        if self._camera is None or self._depth is None or self._depth.header.stamp != msg.header.stamp:
+            return
+        mask = self.segment(image_to_numpy(msg))
+        points = back_project(image_to_numpy(self._depth), self._camera)
+        self._publish(msg, mask, points)
+
+    def segment(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return the (H, W) class ids of an (H, W, 3) image."""
+        logits = self._engine.infer(preprocess(image))
+        charge(self._engine.latency_ns)
+        return decode(logits)
+
+    def _publish(self, msg: Image, mask: NDArray[np.uint8], points: NDArray[np.float64]) -> None:
+        self._mask_pub.publish(numpy_to_image(mask, "mono8", stamp=msg.header.stamp, frame_id=msg.header.frame_id))
+        floor, obstacles = ground_points(mask, points)
+        labelled = np.zeros((len(floor) + len(obstacles), 3), dtype=np.float32)
+        labelled[: len(floor), :2] = floor
+        labelled[len(floor) :, :2] = obstacles
+        labelled[: len(floor), 2] = FLOOR_LABEL
+        labelled[len(floor) :, 2] = OBSTACLE_LABEL
+        self._points_pub.publish(points_to_cloud(labelled, stamp=msg.header.stamp, frame_id="base_link"))
+        marker = locate_marker(mask, points)
+        if marker is not None:
+            out = PointStamped()
+            out.header.stamp = msg.header.stamp
+            out.header.frame_id = "base_link"
+            out.point.x, out.point.y = marker
+            self._marker_pub.publish(out)
