@@ -105,7 +105,8 @@ def arc_clearance(speed: float, turn: float, points: NDArray[np.float64], horizo
         centres = np.stack([speed * t, np.zeros_like(t)], axis=1)
     else:
         centres = (speed / turn) * np.stack([np.sin(turn * t), 1.0 - np.cos(turn * t)], axis=1)
-    return float(np.sqrt(((points[None] - centres[:, None]) ** 2).sum(axis=2).min()))
+    across, along = points[:, 0] - centres[:, :1], points[:, 1] - centres[:, 1:]
+    return float(np.sqrt((across**2 + along**2).min()))
 
 
 class PathTracker:

@@ -131,10 +131,11 @@ class MarkerTracker:
         confirm: sightings needed.
     """
 
-    def __init__(self, gate: float = 0.8, confirm: int = 3) -> None:
+    def __init__(self, gate: float = 0.8, confirm: int = 5) -> None:
         self.gate = gate
         self.confirm = confirm
         self._tracks: list[_Track] = []
+        self._mistakes: list[NDArray[np.float64]] = []
 
     def add(self, position: ArrayLike, distance: float) -> None:
         """Add a sighting.
@@ -144,6 +145,8 @@ class MarkerTracker:
             distance: from the camera, m.
         """
         point = np.asarray(position, dtype=float)
+        if any(float(np.linalg.norm(mistake - point)) < self.gate for mistake in self._mistakes):
+            return
         information = 1.0 / (0.05 + 0.06 * distance) ** 2
         nearest = min(self._tracks, key=lambda t: float(np.linalg.norm(t.position - point)), default=None)
         if nearest is None or float(np.linalg.norm(nearest.position - point)) > self.gate:
@@ -157,10 +160,11 @@ class MarkerTracker:
         nearest.hits += 1
 
     def discard(self) -> None:
-        """Forget the track that :meth:`estimate` returns: it cannot be the marker, for it cannot be reached."""
+        """Give up the track that :meth:`estimate` returns, and ignore sightings there from now on."""
         best = max(self._tracks, key=lambda t: t.hits, default=None)
         if best is not None:
             self._tracks.remove(best)
+            self._mistakes.append(best.position)
 
     def estimate(self) -> tuple[float, float] | None:
         """Return the position of the track seen most often, x, y in m; None until one is confirmed."""

@@ -72,7 +72,8 @@ class GridFrame:
     def inside(self, cells: ArrayLike) -> NDArray[np.bool_]:
         """Return which of the (..., 2) cells lie in the grid."""
         index = np.asarray(cells)
-        return np.asarray(((index >= 0) & (index < np.asarray(self.shape))).all(axis=-1))
+        row, column = index[..., 0], index[..., 1]
+        return np.asarray((row >= 0) & (row < self.shape[0]) & (column >= 0) & (column < self.shape[1]))
 
     def contains(self, cell: Cell) -> bool:
         """Return whether one cell lies in the grid."""

@@ -113,16 +113,14 @@ class OccupancyMapper:
         hit: float,
     ) -> None:
         """Count each cell once per observation; an occupied verdict wins over a free one."""
-        width = self.frame.shape[1]
         cells_free, cells_occupied = self._flat(free), self._flat(occupied)
-        verdict = np.zeros(layer.size, dtype=np.int8)
-        verdict[cells_free] = 1
-        verdict[cells_occupied] = 2
-        touched = np.unique(np.concatenate([cells_free, cells_occupied]))
-        change = np.where(verdict[touched] == 2, hit, -miss).astype(np.float32)
-        rows, columns = touched // width, touched % width
-        layer[rows, columns] = np.clip(layer[rows, columns] + change, -self.params.limit, self.params.limit)
-        seen[rows, columns] = True
+        change = np.zeros(layer.size, dtype=np.float32)
+        change[cells_free] = -miss
+        change[cells_occupied] = hit
+        touched = np.flatnonzero(change)
+        flat = layer.reshape(-1)
+        flat[touched] = np.clip(flat[touched] + change[touched], -self.params.limit, self.params.limit)
+        seen.reshape(-1)[touched] = True
 
     def _flat(self, points: NDArray[np.float64]) -> NDArray[np.intp]:
         cells = self.frame.to_cells(points)

@@ -26,6 +26,8 @@ GIVE_UP_AFTER = 8.0
 """A target that has not been viewed after this long is dropped, s."""
 PATIENCE = 5
 """A marker to which this many requests in a row found no route is taken for a mistake."""
+NEAR, NEAR_PATIENCE = 0.7, 8.0
+"""A marker that is this near, m, for this long, s, without the robot arriving is taken for a mistake, too."""
 ARRIVED = 0.15
 """Distance to the marker's estimated centre that counts as arrived, m."""
 
@@ -51,6 +53,7 @@ class MissionNode(Node):
         self._planned_at = -np.inf
         self._pending: Future | None = None
         self._refusals = 0
+        self._near_since = np.inf
         self._done = False
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._plan_pub = self.create_publisher(Path, "plan", 10)
@@ -88,8 +91,14 @@ class MissionNode(Node):
         self._views.look(pose, self._occupancy)
         goal = self._marker.estimate()
         if goal is not None:
-            if float(np.hypot(goal[0] - pose[0], goal[1] - pose[1])) < ARRIVED:
+            distance = float(np.hypot(goal[0] - pose[0], goal[1] - pose[1]))
+            if distance < ARRIVED:
                 self._finish()
+                return
+            # As near as the map lets it come, and still not there: whatever was seen is no mat to stand on.
+            self._near_since = min(self._near_since, now) if distance < NEAR else np.inf
+            if now - self._near_since > NEAR_PATIENCE:
+                self._give_up_marker()
                 return
             self._request(pose, goal, now)
             return
@@ -149,11 +158,15 @@ class MissionNode(Node):
         if self._marker.estimate() is not None:
             self._refusals += 1
             if self._refusals >= PATIENCE:
-                self._marker.discard()
-                self._refusals = 0
+                self._give_up_marker()
         elif self._target is not None and self._views is not None:
             self._views.reject(*self._target)
             self._target = None
+
+    def _give_up_marker(self) -> None:
+        self._marker.discard()
+        self._refusals = 0
+        self._near_since = np.inf
 
     def _finish(self) -> None:
         self._done = True
