@@ -1,0 +1,334 @@
+"""The simulation: one event heap, the graph of topics and services, and simulated time.
+
+Everything that happens is an event ``(time_ns, sequence)``; ties in time are broken by the order in which
+events were scheduled, so a run is a pure function of the program and its seeds.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import heapq
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Protocol
+
+from robotbrain.errors import InputError
+from robotbrain.ros.exceptions import CallbackError, NotInitializedException, ReentrancyError
+from robotbrain.ros.logging import LoggingSeverity, LogSink, RcutilsLogger, print_sink
+from robotbrain.ros.names import NodeArguments, parse_arguments
+
+if TYPE_CHECKING:
+    from robotbrain.ros.executors import Executor
+    from robotbrain.ros.node import Node
+    from robotbrain.ros.services import Service
+    from robotbrain.ros.topics import Topic
+
+Event = Callable[[Any], None]
+Tap = Callable[[int, str, str, str, bytes], None]
+CallbackTap = Callable[["CallbackRecord"], None]
+
+
+class CostModel(Protocol):
+    """How long callbacks take."""
+
+    def cost(self, node_name: str, kind: str, name: str) -> int:
+        """Return the simulated nanoseconds of one callback.
+
+        Args:
+            node_name: fully qualified node name, e.g. ``/planner``.
+            kind: ``timer``, ``subscription``, ``service`` or ``client``.
+            name: topic or service name; for a timer the name of its callback function.
+        """
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class CallbackRecord:
+    """One executed callback, for monitoring: became ready, started and ended at these simulated times (ns)."""
+
+    node: str
+    kind: str
+    name: str
+    ready_ns: int
+    start_ns: int
+    end_ns: int
+
+
+@dataclass(slots=True)
+class Execution:
+    """The callback that is running now: what it charged and what it has to release when its cost is over."""
+
+    node: Node
+    charged_ns: int = 0
+    outbox: list[tuple[Event, Any]] = field(default_factory=list)
+
+
+class SimContext:
+    """A deterministic ROS graph in simulated time (``rclpy.Context`` of the kit).
+
+    Args:
+        latency_ns: transport latency from publisher to subscription (and each way of a service call): ns,
+            or a function ``(topic, size_bytes) -> ns``. Messages of one publisher never overtake each other.
+        cost_model: what callbacks cost; an object with ``cost(node_name, kind, name) -> ns``, or None for 0.
+        start_ns: simulated time at the start.
+
+    Attributes:
+        now_ns: simulated time in ns.
+        on_callback_error: called with the :class:`CallbackError` of a failed callback; return True to go on
+            (for instance after ``error.node.destroy_node()``, which isolates the node). Unset: it is raised.
+        default_executor_factory: makes the executor of a new node. One single-threaded executor per node by
+            default, as if every node were a process of its own.
+        log_sink: receives every log record; prints by default.
+        horizon_ns: ``rclpy.spin`` stops there, as if Ctrl-C had been pressed; None for no limit.
+    """
+
+    def __init__(
+        self,
+        *,
+        latency_ns: int | Callable[[str, int], int] = 0,
+        cost_model: CostModel | None = None,
+        start_ns: int = 0,
+    ) -> None:
+        from robotbrain.ros.executors import SingleThreadedExecutor
+
+        self.now_ns = start_ns
+        self.latency_ns = latency_ns
+        self.cost_model = cost_model
+        self.on_callback_error: Callable[[CallbackError], bool] | None = None
+        self.default_executor_factory: Callable[[Node], Executor] = lambda node: SingleThreadedExecutor(context=self)
+        self.log_sink: LogSink = print_sink
+        self.log_level = LoggingSeverity.INFO
+        self.horizon_ns: int | None = None
+        self.arguments = NodeArguments()
+        self.topics: dict[str, Topic] = {}
+        self.services: dict[str, Service] = {}
+        self.nodes: list[Node] = []
+        self.taps: list[Tap] = []
+        self.callback_taps: list[CallbackTap] = []
+        self.running: Execution | None = None
+        self._heap: list[tuple[int, int, Event, Any]] = []
+        self._sequence = 0
+        self._failures: deque[CallbackError] = deque()
+        self._ok = True
+        self._init_called = False
+        self._on_shutdown: list[Callable[[], Any]] = []
+        self._logger = RcutilsLogger("robotbrain.ros", self)
+
+    # ------------------------------------------------------------ life cycle
+
+    def init(self, args: list[str] | None = None, *, domain_id: int | None = None) -> None:
+        """Take ROS arguments; a context of the kit is ready as soon as it exists.
+
+        Raises:
+            RuntimeError: called twice.
+        """
+        if self._init_called:
+            raise RuntimeError("Context.init() must only be called once; call rclpy.shutdown() first")
+        self._init_called = True
+        self.arguments = parse_arguments(args)
+
+    def ok(self) -> bool:
+        """Tell whether the context has not been shut down."""
+        return self._ok
+
+    def shutdown(self) -> None:
+        """End the run: ``ok()`` turns False and a running ``run_until`` or ``spin`` returns."""
+        if not self._ok:
+            raise RuntimeError("Context has already been shut down")
+        self.try_shutdown()
+
+    def try_shutdown(self) -> None:
+        """As :meth:`shutdown`, without an error when it already is."""
+        if self._ok:
+            self._ok = False
+            for callback in self._on_shutdown:
+                callback()
+
+    def on_shutdown(self, callback: Callable[[], Any]) -> None:
+        """Call ``callback()`` at shutdown."""
+        self._on_shutdown.append(callback)
+
+    def require_ok(self) -> None:
+        """Raise NotInitializedException after shutdown."""
+        if not self._ok:
+            raise NotInitializedException("the context has been shut down: call rclpy.init() again")
+
+    @contextlib.contextmanager
+    def as_default(self) -> Iterator[SimContext]:
+        """Make this the context that ``rclpy.init()`` and nodes without ``context=`` use, inside the block."""
+        global _default
+        previous, _default = _default, self
+        try:
+            yield self
+        finally:
+            _default = previous
+
+    # ------------------------------------------------------------ time and events
+
+    def schedule(self, time_ns: int, event: Event, argument: Any = None) -> None:
+        """Run ``event(argument)`` at ``time_ns`` (not before now), after all events scheduled earlier for it."""
+        self._sequence += 1
+        heapq.heappush(self._heap, (time_ns if time_ns > self.now_ns else self.now_ns, self._sequence, event, argument))
+
+    def release(self, event: Event, argument: Any) -> None:
+        """Run ``event`` when the running callback's cost is over, or now when none is running.
+
+        This is how publications and service traffic leave a callback.
+        """
+        if self.running is not None:
+            self.running.outbox.append((event, argument))
+        else:
+            self.schedule(self.now_ns, event, argument)
+
+    def charge(self, nanoseconds: int) -> bool:
+        """Add to the cost of the running callback; return False (and do nothing) outside callbacks.
+
+        Raises:
+            InputError: negative.
+        """
+        if nanoseconds < 0:
+            raise InputError(
+                "charge",
+                given=nanoseconds,
+                expected="nanoseconds >= 0",
+                fix="A callback cannot take less than no time.",
+            )
+        if self.running is None:
+            return False
+        self.running.charged_ns += int(nanoseconds)
+        return True
+
+    def sleep(self, nanoseconds: int) -> bool:
+        """Let time pass: charge it inside a callback, run the simulation for it outside; return ``ok()``."""
+        if not self.charge(nanoseconds):
+            self.run_until(self.now_ns + nanoseconds)
+        return self._ok
+
+    def step(self) -> bool:
+        """Process one event; return False when there is none, or after shutdown."""
+        self.check_not_in_callback("step")
+        if not self._heap or not self._ok:
+            return False
+        self.now_ns, _, event, argument = heapq.heappop(self._heap)
+        event(argument)
+        if self._failures:
+            raise self._failures.popleft()
+        return True
+
+    def next_event_ns(self) -> int | None:
+        """Return the time of the next event, or None when nothing is pending."""
+        return self._heap[0][0] if self._heap else None
+
+    def run_until(self, time_ns: int) -> None:
+        """Process every event up to and including ``time_ns`` and set the clock there.
+
+        After a shutdown inside a callback it returns at once, the clock at the time of that callback.
+
+        Raises:
+            InputError: ``time_ns`` has passed.
+            ReentrancyError: called inside a callback.
+            CallbackError: a callback raised; the simulation can go on from there.
+        """
+        self.check_not_in_callback("run_until")
+        if time_ns < self.now_ns:
+            raise InputError(
+                "run_until",
+                given=time_ns,
+                expected=f"a time not before now ({self.now_ns} ns)",
+                fix="Time runs forward.",
+            )
+        heap, pop, failures = self._heap, heapq.heappop, self._failures
+        while heap and heap[0][0] <= time_ns:
+            if not self._ok:
+                return
+            self.now_ns, _, event, argument = pop(heap)
+            event(argument)
+            if failures:
+                raise failures.popleft()
+        if self._ok:
+            self.now_ns = time_ns
+
+    def run_for(self, seconds: float) -> None:
+        """Run for so many simulated seconds; see :meth:`run_until`."""
+        self.run_until(self.now_ns + round(seconds * 1e9))
+
+    def fail(self, error: CallbackError) -> None:
+        """Give a failed callback to the error hook, or raise it once the current event is complete.
+
+        Not at once: the other receivers of the message that the callback choked on must still get it.
+        """
+        if self.on_callback_error is None or not self.on_callback_error(error):
+            self._failures.append(error)
+
+    def check_not_in_callback(self, what: str) -> None:
+        """Raise ReentrancyError inside a callback."""
+        if self.running is not None:
+            raise ReentrancyError(
+                f"{what} was called inside a callback of {self.running.node.get_fully_qualified_name()}; "
+                "a callback must return to let others run: use call_async with add_done_callback, or a timer"
+            )
+
+    def transport_ns(self, name: str, size: int) -> int:
+        """Return the transport latency of ``size`` bytes on a topic or service."""
+        latency = self.latency_ns
+        return latency if isinstance(latency, int) else int(latency(name, size))
+
+    # ------------------------------------------------------------ observation
+
+    def add_tap(self, tap: Tap) -> Callable[[], None]:
+        """Call ``tap(release_time_ns, topic, type_name, publisher_node, cdr)`` for every publication, in order.
+
+        Returns:
+            A function that removes the tap.
+        """
+        self.taps.append(tap)
+        return lambda: self.taps.remove(tap)
+
+    def add_callback_tap(self, tap: CallbackTap) -> Callable[[], None]:
+        """Call ``tap(record)`` for every executed callback; returns a function that removes it."""
+        self.callback_taps.append(tap)
+        return lambda: self.callback_taps.remove(tap)
+
+    def get_logger(self) -> RcutilsLogger:
+        """Return the logger of the context itself."""
+        return self._logger
+
+
+_default: SimContext | None = None
+_active: SimContext | None = None
+
+
+def active_context() -> SimContext | None:
+    """Return the context whose callback is running now, or None."""
+    return _active
+
+
+def set_running(context: SimContext, execution: Execution | None) -> None:
+    """Mark ``execution`` as the callback that is running (None: no longer)."""
+    global _active
+    context.running = execution
+    _active = context if execution is not None else None
+
+
+def get_default_context() -> SimContext:
+    """Return the default context.
+
+    Raises:
+        NotInitializedException: ``rclpy.init()`` was not called.
+    """
+    if _default is None:
+        raise NotInitializedException
+    return _default
+
+
+def set_default_context(context: SimContext | None) -> SimContext | None:
+    """Make ``context`` the default (None: none); return the former one."""
+    global _default
+    previous, _default = _default, context
+    return previous
+
+
+def peek_default_context() -> SimContext | None:
+    """Return the default context, or None."""
+    return _default

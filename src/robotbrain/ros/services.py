@@ -1,0 +1,260 @@
+"""Services and clients (``rclpy.service``, ``rclpy.client``)."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from robotbrain.errors import InputError
+from robotbrain.ros import cdr
+from robotbrain.ros.callback_groups import CallbackGroup
+from robotbrain.ros.entity import Entity
+from robotbrain.ros.exceptions import ReentrancyError, SimulationDeadlockError, TypeConflictError
+from robotbrain.ros.executors import Work
+from robotbrain.ros.qos import QoSProfile
+from robotbrain.ros.task import Future
+
+if TYPE_CHECKING:
+    from robotbrain.ros.node import Node
+
+_MAX_FAILED_WAITS = 100
+
+
+def srv_name_of(srv_type: Any) -> str:
+    """Return the ROS name of a service class; raise InputError when it is none."""
+    name = getattr(srv_type, "__srvtype__", None)
+    if not isinstance(name, str):
+        raise InputError(
+            "service type",
+            given=srv_type,
+            expected="a service class such as std_srvs.srv.Trigger",
+            fix="Pass the class itself: from std_srvs.srv import Trigger.",
+        )
+    return name
+
+
+class Service(Entity):
+    """Answers requests: ``callback(request, response) -> response``, plain or ``async def``."""
+
+    kind = "service"
+
+    def __init__(
+        self,
+        node: Node,
+        srv_type: Any,
+        srv_name: str,
+        callback: Callable[[Any, Any], Any],
+        qos: QoSProfile,
+        group: CallbackGroup | None = None,
+    ) -> None:
+        super().__init__(node, srv_name, callback, group)
+        self.srv_type, self.srv_name, self.qos_profile = srv_type, srv_name, qos
+        self.typename = srv_name_of(srv_type)
+        self._queue: deque[Work] = deque()
+        known = node.context.services.get(srv_name)
+        if known is not None:
+            raise TypeConflictError(
+                f"service {srv_name}",
+                given=f"a second server, in {node.get_fully_qualified_name()}",
+                expected=f"one server; {known.node.get_fully_qualified_name()} has it",
+                fix="Give it another name or destroy the first.",
+            )
+        node.context.services[srv_name] = self
+
+    @property
+    def service_name(self) -> str:
+        """Absolute service name."""
+        return self.srv_name
+
+    def receive(self, request: tuple[Client, bytes, Future]) -> None:
+        """Queue a request that has arrived; a full queue loses its oldest, whose future never completes."""
+        work = Work(self, request, self.node.context.now_ns)
+        limit = self.qos_profile.queue_limit
+        if limit is not None and len(self._queue) >= limit:
+            lost = self._queue.popleft()
+            lost.alive = False
+            self.node.get_logger().warning(
+                f"service {self.srv_name}: queue of {limit} requests is full; the oldest, from "
+                f"{lost.payload[0].node.get_fully_qualified_name()}, is lost"
+            )
+        self._queue.append(work)
+        self.node._enqueue(work)
+
+    def execute(self, work: Work) -> Any:
+        """Decode the request and call back."""
+        self._queue.remove(work)
+        assert self.callback is not None
+        return self.callback(cdr.from_cdr(work.payload[1], self.srv_type.Request), self.srv_type.Response())
+
+    def complete(self, work: Work, result: Any) -> None:
+        """Send the response.
+
+        Raises:
+            TypeError: the callback returned something else than a response.
+        """
+        if not isinstance(result, self.srv_type.Response):
+            raise TypeError(
+                f"the callback of service {self.srv_name} returned {type(result).__name__}; it must return the "
+                f"{self.typename} Response it was given (is 'return response' missing?)"
+            )
+        client, _, future = work.payload
+        data = cdr.to_cdr(result)
+        self.node.context.release(client.deliver, (data, future))
+
+    def destroy(self) -> None:
+        """Stop serving."""
+        if not self.destroyed:
+            self.node.context.services.pop(self.srv_name, None)
+            for work in self._queue:
+                work.alive = False
+            super().destroy()
+
+
+class Client(Entity):
+    """Calls a service."""
+
+    kind = "client"
+
+    def __init__(
+        self, node: Node, srv_type: Any, srv_name: str, qos: QoSProfile, group: CallbackGroup | None = None
+    ) -> None:
+        super().__init__(node, srv_name, None, group)
+        self.srv_type, self.srv_name, self.qos_profile = srv_type, srv_name, qos
+        self.typename = srv_name_of(srv_type)
+        self._failed_waits = 0
+
+    @property
+    def service_name(self) -> str:
+        """Absolute service name."""
+        return self.srv_name
+
+    @property
+    def callback_name(self) -> str:
+        """Readable name for error messages."""
+        return f"done callback of {self.srv_name}"
+
+    def call_async(self, request: Any) -> Future:
+        """Send a request; the future completes when the response has come back.
+
+        Raises:
+            TypeError: not a request of this service.
+            TypeConflictError: the server has another type.
+        """
+        self.check_usable()
+        if not isinstance(request, self.srv_type.Request):
+            raise TypeError(
+                f"call of {self.srv_name}: expected a {self.typename} Request, got {type(request).__name__}"
+                f"; build it with {self.srv_type.__name__}.Request()"
+            )
+        future = Future()
+        future.completed_in = self.callback_group
+        self.node.context.release(self._send, (cdr.to_cdr(request), future))
+        return future
+
+    def _send(self, call: tuple[bytes, Future]) -> None:
+        context = self.node.context
+        delay = context.transport_ns(self.srv_name, len(call[0]))
+        context.schedule(context.now_ns + delay, self._arrive, call)
+
+    def _arrive(self, call: tuple[bytes, Future]) -> None:
+        server = self._server()
+        if server is None:
+            self.node.get_logger().warning(
+                f"request to {self.srv_name} is lost: no node offers this service. {self._offers()}"
+            )
+            return
+        server.receive((self, *call))
+
+    def deliver(self, answer: tuple[bytes, Future]) -> None:
+        """Take a response on its way back."""
+        context = self.node.context
+        delay = context.transport_ns(self.srv_name, len(answer[0]))
+        context.schedule(context.now_ns + delay, self._receive, answer)
+
+    def _receive(self, answer: tuple[bytes, Future]) -> None:
+        if not self.destroyed:
+            self.node._enqueue(Work(self, answer, self.node.context.now_ns))
+
+    def execute(self, work: Work) -> Any:
+        """Complete the future; its done callbacks run on this node's executor."""
+        data, future = work.payload
+        if not future.done():
+            future.set_result(cdr.from_cdr(data, self.srv_type.Response))
+
+    def call(self, request: Any, timeout_sec: float | None = None) -> Any:
+        """Call and wait, outside callbacks only.
+
+        Raises:
+            ReentrancyError: inside a callback, where genuine rclpy deadlocks.
+            TimeoutError: no answer in time.
+        """
+        if self.node.context.running is not None:
+            raise ReentrancyError(
+                f"client.call({self.srv_name}) inside a callback waits for an answer that can only come after the "
+                "callback returns (genuine rclpy deadlocks): use future = client.call_async(request) and "
+                "future.add_done_callback(...), or 'await' it in an async def callback"
+            )
+        future = self.call_async(request)
+        executor = self.node.executor
+        if executor is None:
+            raise SimulationDeadlockError(f"node {self.node.get_name()} has no executor to receive the answer")
+        executor.spin_until_future_complete(future, timeout_sec)
+        if not future.done():
+            raise TimeoutError(f"service {self.srv_name} gave no answer within {timeout_sec} s")
+        return future.result()
+
+    def remove_pending_request(self, future: Future) -> None:
+        """Forget a call: cancel its future."""
+        future.cancel()
+
+    def _server(self) -> Service | None:
+        server = self.node.context.services.get(self.srv_name)
+        if server is not None and server.typename != self.typename:
+            raise TypeConflictError(
+                f"type of service {self.srv_name}",
+                given=self.typename,
+                expected=f"{server.typename}, as {server.node.get_fully_qualified_name()} serves it",
+                fix="Create the client with that type.",
+            )
+        return server
+
+    def service_is_ready(self) -> bool:
+        """Tell whether a node offers the service."""
+        return self._server() is not None
+
+    def wait_for_service(self, timeout_sec: float | None = None) -> bool:
+        """Return whether the service is there, letting simulated time pass until it is.
+
+        Inside a callback it answers at once: nothing else can happen before the callback returns.
+
+        Raises:
+            SimulationDeadlockError: waited without limit, or 100 times in vain.
+        """
+        if self.service_is_ready():
+            self._failed_waits = 0
+            return True
+        context = self.node.context
+        if context.running is None:
+            executor = self.node.executor
+            if executor is not None:
+                try:
+                    executor._spin_while(lambda: not self.service_is_ready(), timeout_sec, "wait_for_service")
+                except SimulationDeadlockError:
+                    raise SimulationDeadlockError(self._never()) from None
+            if self.service_is_ready():
+                self._failed_waits = 0
+                return True
+        self._failed_waits += 1
+        if self._failed_waits >= _MAX_FAILED_WAITS:
+            raise SimulationDeadlockError(self._never())
+        return False
+
+    def _never(self) -> str:
+        return (
+            f"{self.node.get_fully_qualified_name()} waits in vain for service {self.srv_name} ({self.typename}): "
+            f"create the node that serves it first, or check the name. {self._offers()}"
+        )
+
+    def _offers(self) -> str:
+        return "Services offered: " + (", ".join(sorted(self.node.context.services)) or "none")
