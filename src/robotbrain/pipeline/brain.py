@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from robotbrain.ros.context import CallbackRecord
     from robotbrain.sim import RobotSim, World
+    from robotbrain.sim.view import Replay
 
 ROLES = ("perception", "estimator", "mapper", "planner", "mission", "controller")
 """The nodes of a brain. Each can be replaced through ``parts``."""
@@ -62,6 +63,7 @@ class RunResult:
         marker: the goal position that the brain believed in at the end, in the map frame; None if it never had one.
         box_poses: (T, boxes, 3) x, y, yaw of the movable boxes at the times of ``trajectory``.
         wall_seconds: real time the run took.
+        world: where it happened.
     """
 
     seed: int
@@ -81,11 +83,26 @@ class RunResult:
     marker: tuple[float, float] | None
     box_poses: NDArray[np.float64] = field(repr=False)
     wall_seconds: float
+    world: World = field(repr=False)
 
     @property
     def real_time_factor(self) -> float:
         """Simulated seconds per real second."""
         return self.seconds / self.wall_seconds
+
+    def replay(self) -> Replay:
+        """Return the run as a replay to watch in 3D: ``run.replay().show()`` in a notebook."""
+        from robotbrain.sim import Pose2D, to_parent
+        from robotbrain.sim.view import Replay
+
+        replay = Replay(self.world)
+        for (t, x, y, yaw), boxes in zip(self.trajectory, self.box_poses, strict=True):
+            poses = tuple(Pose2D(*(float(v) for v in box)) for box in boxes)
+            replay.add_state(float(t), Pose2D(float(x), float(y), float(yaw)), poses)
+        for t, points in self.plans:
+            if len(points) > 1:
+                replay.add_plan(t, to_parent(self.world.start, points))
+        return replay
 
 
 class ProfileCosts:
@@ -234,6 +251,7 @@ def drive(
         marker=watch.marker,
         box_poses=np.array(watch.boxes),
         wall_seconds=time.perf_counter() - began,
+        world=world,
     )
 
 

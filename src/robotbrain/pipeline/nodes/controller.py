@@ -15,7 +15,7 @@ from robotbrain.pipeline.control import ControlParams, PathTracker
 from robotbrain.pipeline.geometry import Pose, PoseBuffer, inverse, transform
 from robotbrain.pipeline.nodes.mapper import Waiting
 from robotbrain.pipeline.nodes.perception import FLOOR_LABEL
-from robotbrain.ros.conversions import cloud_to_points, path_to_numpy, scan_to_arrays, time_to_ns, quaternion_to_yaw
+from robotbrain.ros.conversions import cloud_to_points, path_to_numpy, quaternion_to_yaw, scan_to_arrays, time_to_ns
 
 RATE_HZ = 20.0
 SCAN_MAX_AGE, POINTS_MAX_AGE = 0.5, 2.0
@@ -53,7 +53,9 @@ class ControllerNode(Node):
 
     def _on_odometry(self, msg: Odometry) -> None:
         position = msg.pose.pose.position
-        self._poses.add(time_to_ns(msg.header.stamp), (position.x, position.y, quaternion_to_yaw(msg.pose.pose.orientation)))
+        self._poses.add(
+            time_to_ns(msg.header.stamp), (position.x, position.y, quaternion_to_yaw(msg.pose.pose.orientation))
+        )
         self._waiting.flush()
 
     def _on_path(self, msg: Path) -> None:
@@ -93,8 +95,6 @@ class ControllerNode(Node):
         now = self.get_clock().now().nanoseconds
         command = Twist()
         if pose is not None and self._scan is not None and now - self._scan.stamp_ns < SCAN_MAX_AGE * 1e9:
-            chosen = self._tracker.command(
-                now * 1e-9, pose, self._path, self._final_yaw, self._obstacles(pose, now)
-            )
+            chosen = self._tracker.command(now * 1e-9, pose, self._path, self._final_yaw, self._obstacles(pose, now))
             command.linear.x, command.angular.z = chosen.speed, chosen.turn
         self._publisher.publish(command)

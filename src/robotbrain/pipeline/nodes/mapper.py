@@ -14,9 +14,9 @@ from sensor_msgs.msg import LaserScan, PointCloud2
 from robotbrain.pipeline.geometry import Pose, PoseBuffer
 from robotbrain.pipeline.grid import GridFrame
 from robotbrain.pipeline.mapping import OccupancyMapper
-from robotbrain.pipeline.nodes.perception import FLOOR_LABEL
 from robotbrain.pipeline.nodes.grids import grid_to_msg
-from robotbrain.ros.conversions import cloud_to_points, scan_to_arrays, time_to_ns, quaternion_to_yaw
+from robotbrain.pipeline.nodes.perception import FLOOR_LABEL
+from robotbrain.ros.conversions import cloud_to_points, quaternion_to_yaw, scan_to_arrays, time_to_ns
 
 MAP_HALF_EXTENT, MAP_RESOLUTION = 11.0, 0.05
 """The map reaches this far from the start, m, whatever way the robot first faced."""
@@ -74,7 +74,9 @@ class MapperNode(Node):
 
     def _on_odometry(self, msg: Odometry) -> None:
         position = msg.pose.pose.position
-        self._poses.add(time_to_ns(msg.header.stamp), (position.x, position.y, quaternion_to_yaw(msg.pose.pose.orientation)))
+        self._poses.add(
+            time_to_ns(msg.header.stamp), (position.x, position.y, quaternion_to_yaw(msg.pose.pose.orientation))
+        )
         self._waiting.flush()
 
     def _on_scan(self, msg: LaserScan) -> None:

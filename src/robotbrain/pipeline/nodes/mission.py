@@ -15,9 +15,9 @@ from std_msgs.msg import Bool
 from robotbrain.pipeline.exploration import MarkerTracker, ViewMemory
 from robotbrain.pipeline.geometry import Pose, PoseBuffer, transform
 from robotbrain.pipeline.grid import GridFrame
-from robotbrain.pipeline.nodes.mapper import Waiting
 from robotbrain.pipeline.nodes.grids import grid_from_msg
-from robotbrain.ros.conversions import numpy_to_path, time_to_ns, quaternion_to_yaw, yaw_to_quaternion
+from robotbrain.pipeline.nodes.mapper import Waiting
+from robotbrain.ros.conversions import numpy_to_path, quaternion_to_yaw, time_to_ns, yaw_to_quaternion
 
 RATE_HZ = 4.0
 REPLAN_AFTER = 1.0
@@ -67,7 +67,9 @@ class MissionNode(Node):
 
     def _on_odometry(self, msg: Odometry) -> None:
         position = msg.pose.pose.position
-        self._poses.add(time_to_ns(msg.header.stamp), (position.x, position.y, quaternion_to_yaw(msg.pose.pose.orientation)))
+        self._poses.add(
+            time_to_ns(msg.header.stamp), (position.x, position.y, quaternion_to_yaw(msg.pose.pose.orientation))
+        )
         self._waiting.flush()
 
     def _on_map(self, msg: OccupancyGrid) -> None:

@@ -19,7 +19,7 @@ from robotbrain.pipeline.segmentation import (
     preprocess,
 )
 from robotbrain.ros import charge
-from robotbrain.ros.conversions import numpy_to_image, image_to_numpy, points_to_cloud
+from robotbrain.ros.conversions import image_to_numpy, numpy_to_image, points_to_cloud
 
 FLOOR_LABEL, OBSTACLE_LABEL = 0.0, 1.0
 """Third coordinate of a published point: 0 on the floor, 1 on an obstacle (the points themselves are flat)."""
@@ -52,9 +52,7 @@ class PerceptionNode(Node):
 
     def _on_info(self, msg: CameraInfo) -> None:
         x, y, z, pitch = self._mounting
-        self._camera = CameraModel(
-            float(msg.k[0]), float(msg.k[4]), float(msg.k[2]), float(msg.k[5]), (x, y, z), pitch
-        )
+        self._camera = CameraModel(float(msg.k[0]), float(msg.k[4]), float(msg.k[2]), float(msg.k[5]), (x, y, z), pitch)
 
     def _on_depth(self, msg: Image) -> None:
         self._depth = msg

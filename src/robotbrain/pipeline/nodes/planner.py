@@ -9,9 +9,9 @@ from nav_msgs.srv import GetPlan
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
+from robotbrain.pipeline.nodes.grids import grid_from_msg
 from robotbrain.pipeline.planning import InflationParams, plan_path
 from robotbrain.ros import charge
-from robotbrain.pipeline.nodes.grids import grid_from_msg
 from robotbrain.ros.conversions import numpy_to_path
 
 
@@ -23,9 +23,7 @@ class PlannerNode(Node):
         planning_ns: simulated CPU time of a plan by cells expanded; None means it takes none.
     """
 
-    def __init__(
-        self, params: InflationParams | None = None, planning_ns: Callable[[int], int] | None = None
-    ) -> None:
+    def __init__(self, params: InflationParams | None = None, planning_ns: Callable[[int], int] | None = None) -> None:
         super().__init__("planner")
         self._params = params
         self._planning_ns = planning_ns

@@ -11,7 +11,7 @@ from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import CameraInfo, Image, Imu, JointState, LaserScan
 
-from robotbrain.ros.conversions import numpy_to_image, ns_to_time
+from robotbrain.ros.conversions import ns_to_time, numpy_to_image
 from robotbrain.sim import RobotSim
 
 IMU_HZ, WHEELS_HZ, SCAN_HZ, CAMERA_HZ = 100.0, 50.0, 10.0, 10.0

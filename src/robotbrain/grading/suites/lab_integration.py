@@ -1,0 +1,288 @@
+"""Visible tests of the lab `lab_integration`: what `lab.check` runs, and half of what is graded."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from robotbrain.grading import Suite, expect, expect_close
+from robotbrain.grading.suites import lab_integration_tools as tools
+
+suite = Suite("lab_integration")
+
+suite.exercise("preprocess", title="1.1 What the network eats", points=6)
+suite.exercise("back_project", title="1.2 From pixels to metres", points=10)
+suite.exercise("deadline", title="1.3 Does it keep up?", points=4, provides=("deadline_slack_ms",))
+suite.exercise("inflate", title="2.1 A costmap", points=8)
+suite.exercise("astar", title="2.2 A*", points=16)
+suite.exercise("smooth", title="2.3 Straighten the path", points=8)
+suite.exercise("goal_tracker", title="3.1 Where was I when I saw that?", points=10, provides=("GoalTracker",))
+suite.exercise(
+    "planner_node",
+    title="3.2 The planner as a ROS 2 node",
+    points=10,
+    upstream=("inflate", "astar", "smooth"),
+    provides=("MyPlanner",),
+)
+suite.exercise("evaluate", title="4 How good is it?", points=10)
+suite.exercise("gap", title="5.1 The gap", points=8, provides=("paired_gap",))
+
+# Stand-ins for a student's part that is not right yet, so that what builds on it can still be graded.
+suite.reference("preprocess", "robotbrain.pipeline.segmentation:preprocess")
+suite.reference("back_project", "robotbrain.pipeline.segmentation:back_project")
+suite.reference("inflate", lambda: tools.inflate)
+suite.reference("astar", "robotbrain.pipeline.planning:astar")
+suite.reference("smooth", "robotbrain.pipeline.planning:smooth")
+suite.reference("MyPlanner", "robotbrain.pipeline.nodes.planner:PlannerNode")
+
+HELPERS = (
+    "PoseBuffer",
+    "cells_on_segment",
+    "grid_from_msg",
+    "interpolate",
+    "nearest_free",
+    "path_cost",
+    "segment_cost",
+    "wrap",
+)
+for _exercise in suite.exercises:
+    suite.forbid(_exercise, imports=("robotbrain.pipeline", "robotbrain.grading"), allow=HELPERS)
+
+_HINTS = {
+    "scale-pixels": "The network was trained on pixels divided by 255. Unscaled, every input is far outside what it knows.",
+    "normalise-channels": "After dividing by 255, subtract 0.45 and divide by 0.25.",
+    "reshape-is-not-transpose": "`reshape` keeps the numbers in their order and only cuts them up anew, so colours and "
+    "places get mixed. To move an axis use `transpose(2, 0, 1)`.",
+    "batch-axis": "The network takes a batch: one image needs a leading axis of length 1, as in `x[None]`.",
+    "float32": "NumPy computes in float64 unless told otherwise; ONNX Runtime wants float32: end with `.astype(np.float32)`.",
+    "y-points-left": "In the base frame y points LEFT (REP 103), in the image u grows to the RIGHT: y = p_y - x_c.",
+    "pitch-rotates": "The camera is tilted: a pixel on the optical axis lies not only ahead but also lower. Rotate by the "
+    "pitch before adding the camera's position.",
+    "depth-is-not-range": "Depth is measured along the optical axis, so z_c IS the depth. Only a range along the ray "
+    "would have to be divided by the ray's length.",
+    "nan-without-depth": "Where nothing returned, depth is inf; a point there is no point. Turn it into NaN first.",
+    "camera-position": "The points are wanted from the base's origin, not from the camera: add camera.position.",
+    "milliseconds": "A period is 1 / rate seconds, that is 1000 / rate milliseconds.",
+    "both-costs": "One image costs CPU time (callback_ms) AND inference (segmentation_ms): subtract both.",
+    "cells-or-metres": "`distance_transform_edt` counts cells unless you pass `sampling=resolution`; radius and decay are metres.",
+    "unknown-costs-more": "-1 means that nobody has looked there: no obstacle, but 2 dearer than seen floor.",
+    "lethal-radius": "Within the radius (d <= radius) the robot's centre must never be: the cost is inf there.",
+    "threshold-65": "From 65 percent on a cell is an obstacle; 64 is not.",
+    "decay-from-radius": "The extra cost is `weight` right at the radius and falls from there: the exponent is "
+    "-(d - radius) / decay.",
+    "diagonal-cost": "A diagonal step is sqrt(2) long. With a length of 1, zigzag looks as short as straight.",
+    "admissible-heuristic": "Manhattan distance overestimates where diagonal steps are allowed, so A* may settle for a "
+    "dearer path. Use the octile distance.",
+    "corner-cutting": "A diagonal step between two cells is only allowed if both cells beside it are finite.",
+    "use-the-costs": "A step costs its length times the MEAN of the two cells' costs. Counting steps alone ignores the costmap.",
+    "expand-by-f": "Order the queue by f = g + h, and stop when the goal is taken OFF the queue, not when it is first seen.",
+    "no-route": "When the queue runs empty without reaching the goal there is no route: return None.",
+    "path-ends": "The path holds both ends: it starts with `start` and ends with `goal`.",
+    "lethal-shortcut": "A segment may be used only if segment_cost is finite: check the cells in between, not only its ends.",
+    "keep-the-distance": "Compare the segment's cost with `slack` times the cost of the stretch it replaces; a shortcut "
+    "that is merely free of collisions hugs the corner.",
+    "farthest-first": "From each kept cell take the FARTHEST cell that is allowed, not the next best one.",
+    "pose-at-stamp": "The sighting belongs to the moment its image was taken. Ask the buffer for the pose AT that stamp, "
+    "not for the newest one.",
+    "rotate-then-add": "The sighting is given in the robot's frame: rotate it by the yaw, then add the robot's position.",
+    "three-sightings": "Fewer than three sightings are no goal yet: return None.",
+    "drop-unknown-pose": "If the buffer has no pose for the stamp, `at` returns None: drop that sighting.",
+    "row-is-y": "Cells are (row, column), rows are y. Let frame.to_cell and frame.to_points do the swapping.",
+    "return-response": "A service callback must return the response, also when it is empty.",
+    "empty-when-stuck": "Without a map or a route the response's path stays empty, and the callback still returns.",
+    "off-the-map": "Start or goal may lie in a blocked cell: use nearest_free before searching.",
+    "wilson-not-wald": "p ± z·sqrt(p(1-p)/n) collapses to a point at 0 and 1. Wilson's interval does not.",
+    "once-per-seed": "Call drive exactly once for each seed: runs are dear, and a second call would be another sample.",
+    "pool-latencies": "Take the percentile of all latencies of all runs together, not the mean of each run's percentile.",
+    "success-is-the-judges": "`run.success` is the judge's verdict (arrived, on the mat, nothing touched); use that.",
+    "pairs": "Each world was driven by both robots: take differences first, then their mean and spread. Unpaired "
+    "intervals drown the gap in the differences between worlds.",
+    "sample-deviation": "s_d divides by n - 1: `std(ddof=1)`.",
+    "t-not-z": "With a handful of pairs use Student's t with n - 1 degrees of freedom; 1.96 is too narrow.",
+    "surrogate-minus-simulated": "The gap is surrogate minus simulated: positive when the surrogate is slower.",
+}
+for _key, _text in _HINTS.items():
+    suite.hint(_key, _text)
+
+
+# ---------------------------------------------------------------- Part 1
+
+
+@suite.test("preprocess", points=3, name="right values for a known image", reread="Exercise 1.1")
+def preprocess_values(student: Any) -> None:
+    tools.compare_preprocess(student.preprocess, tools.gradient_image(6, 5))
+
+
+@suite.test("preprocess", points=1, name="float32, as the network wants it", hint="float32", reread="Exercise 1.1")
+def preprocess_dtype(student: Any) -> None:
+    answer = np.asarray(student.preprocess(tools.gradient_image(6, 5)))
+    expect(answer.dtype == np.float32, "the dtype is not float32", got=str(answer.dtype), expected="float32")
+
+
+@suite.test("back_project", points=2, name="the pixel on the optical axis", reread="Exercise 1.2")
+def back_project_axis(student: Any) -> None:
+    camera = tools.camera(pitch=0.3)
+    depth = np.full((5, 5), 2.0)
+    point = tools.points_of(student.back_project, depth, camera)[2, 2]
+    expected = (0.1 + 2 * np.cos(0.3), 0.0, 0.26 - 2 * np.sin(0.3))
+    flat = (0.1 + 2.0, 0.0, 0.26)
+    hint = "pitch-rotates" if np.allclose(point, flat, atol=1e-6) else ""
+    bare = np.subtract(expected, camera.position)
+    hint = "camera-position" if np.allclose(point, bare, atol=1e-6) else hint
+    expect_close(
+        point,
+        expected,
+        atol=1e-6,
+        given="depth 2 m everywhere, pixel (row 2, column 2) on the axis, pitch 0.3 rad",
+        hint=hint,
+    )
+
+
+@suite.test("back_project", points=3, name="left stays left, on a level camera", reread="Exercise 1.2")
+def back_project_level(student: Any) -> None:
+    tools.compare_points(student.back_project, np.full((5, 5), 2.0), tools.camera(pitch=0.0))
+
+
+@suite.test(
+    "back_project", points=1, name="no depth, no point", hint="nan-without-depth", reread="Exercise 1.2, last paragraph"
+)
+def back_project_nan(student: Any) -> None:
+    depth = np.full((5, 5), 2.0)
+    depth[0, 1] = np.inf
+    points = tools.points_of(student.back_project, depth, tools.camera(pitch=0.2))
+    expect(np.isnan(points[0, 1]).all(), "a pixel without depth should be NaN", got=points[0, 1], expected="three NaN")
+    expect(np.isfinite(points[1:]).all(), "pixels with a depth should be finite", got=points[1:])
+
+
+@suite.test("deadline", points=2, name="a period of 100 ms", reread="Exercise 1.3")
+def deadline_simple(student: Any) -> None:
+    tools.compare_deadline(student.deadline_slack_ms, tools.profile(20.0, 5.0), 10.0)
+
+
+# ---------------------------------------------------------------- Part 2
+
+
+@suite.test("inflate", points=3, name="one obstacle in an open field", reread="Exercise 2.1")
+def inflate_point(student: Any) -> None:
+    occupancy = np.zeros((15, 17), dtype=np.int8)
+    occupancy[7, 8] = 100
+    tools.compare_inflation(student.inflate, occupancy, 0.1, radius=0.25, decay=0.2, weight=8.0)
+
+
+@suite.test("inflate", points=1, name="unknown cells cost 2 more", hint="unknown-costs-more", reread="Exercise 2.1")
+def inflate_unknown(student: Any) -> None:
+    occupancy = np.array([[0, -1, 0]], dtype=np.int8)
+    expect_close(student.inflate(occupancy, 0.05), [[1.0, 3.0, 1.0]], given="occupancy [[0, -1, 0]], no obstacle")
+
+
+@suite.test("astar", points=2, name="straight across an empty field", reread="Exercise 2.2")
+def astar_straight(student: Any) -> None:
+    tools.compare_astar(student.astar, np.ones((5, 9)), (2, 0), (2, 8))
+
+
+@suite.test("astar", points=2, name="diagonal steps are longer", hint="diagonal-cost", reread="Exercise 2.2")
+def astar_diagonal(student: Any) -> None:
+    cost = np.ones((7, 12))
+    path = tools.compare_astar(student.astar, cost, (1, 0), (3, 11))
+    # Any optimal path has exactly two diagonal steps; a zigzag that is as long in steps has more.
+    diagonals = int((np.abs(np.diff(path, axis=0)).sum(axis=1) == 2).sum())
+    expect(diagonals == 2, "the path zigzags", got=f"{diagonals} diagonal steps", expected="2 diagonal steps")
+
+
+@suite.test("astar", points=2, name="around a dear patch", hint="use-the-costs", reread="Exercise 2.2")
+def astar_weights(student: Any) -> None:
+    cost = np.ones((9, 11))
+    cost[2:7, 4:7] = 9.0
+    tools.compare_astar(student.astar, cost, (4, 0), (4, 10))
+
+
+@suite.test("astar", points=1, name="no route is None", hint="no-route", reread="Exercise 2.2, last paragraph")
+def astar_no_route(student: Any) -> None:
+    cost = np.ones((5, 5))
+    cost[:, 2] = np.inf
+    answer = student.astar(cost, (2, 0), (2, 4))
+    expect(answer is None, "there is no route through a closed wall", got=answer, expected="None")
+
+
+@suite.test("smooth", points=2, name="a staircase in the open becomes one segment", hint="farthest-first")
+def smooth_open(student: Any) -> None:
+    path = [(0, 0), (1, 1), (1, 2), (2, 3), (2, 4), (3, 5), (3, 6), (4, 7)]
+    kept = tools.smoothed(student.smooth, path, np.ones((6, 9)))
+    expect(kept == [(0, 0), (4, 7)], got=kept, expected=[(0, 0), (4, 7)], given=path)
+
+
+@suite.test("smooth", points=2, name="never through a wall", hint="lethal-shortcut", reread="Exercise 2.3")
+def smooth_wall(student: Any) -> None:
+    cost = np.ones((8, 9))
+    cost[0:6, 4] = np.inf
+    path = [(1, 1), (2, 2), (3, 3), (4, 3), (5, 3), (6, 3), (6, 4), (6, 5), (5, 5), (4, 5), (3, 5), (2, 6), (1, 7)]
+    tools.check_smoothed(student.smooth, path, cost)
+
+
+# ---------------------------------------------------------------- Part 3
+
+
+@suite.test("goal_tracker", points=2, name="three sightings from one place", reread="Exercise 3.1")
+def tracker_still(student: Any) -> None:
+    tools.compare_tracker(student.GoalTracker, poses=[(0, (1.0, 2.0, np.pi / 2)), (10**9, (1.0, 2.0, np.pi / 2))])
+
+
+@suite.test("goal_tracker", points=2, name="a robot that turns while the network thinks", reread="Exercise 3.1")
+def tracker_turning(student: Any) -> None:
+    poses = [(k * 10**8, (0.0, 0.0, 0.1 * k)) for k in range(11)]
+    tools.compare_tracker(student.GoalTracker, poses=poses)
+
+
+@suite.test("goal_tracker", points=1, name="two sightings are no goal", hint="three-sightings", reread="Exercise 3.1")
+def tracker_patience(student: Any) -> None:
+    tracker = student.GoalTracker()
+    tracker.add_pose(0, (0.0, 0.0, 0.0))
+    expect(tracker.goal() is None, "a goal without any sighting", got=tracker.goal(), expected="None")
+    for _ in range(2):
+        tracker.add_sighting(0, (1.0, 0.0))
+    expect(tracker.goal() is None, "a goal after two sightings", got=tracker.goal(), expected="None")
+
+
+@suite.test("planner_node", points=3, name="answers with a path around a wall", reread="Exercise 3.2", time_limit_s=20)
+def planner_answers(student: Any) -> None:
+    tools.compare_plan(student.MyPlanner, tools.walled_map(), (-1.5, 0.4), (1.5, 0.4))
+
+
+@suite.test(
+    "planner_node",
+    points=2,
+    name="an empty path without a map",
+    hint="empty-when-stuck",
+    reread="Exercise 3.2",
+    time_limit_s=20,
+)
+def planner_without_map(student: Any) -> None:
+    points = tools.ask_for_plan(student.MyPlanner, None, (0.0, 0.0), (1.0, 0.0))
+    expect(len(points) == 0, "a path without a map", got=points, expected="an empty path")
+
+
+# ---------------------------------------------------------------- Parts 4 and 5
+
+
+@suite.test("evaluate", points=3, name="rate and interval of made-up runs", reread="Exercise 4")
+def evaluate_rate(student: Any) -> None:
+    tools.compare_evaluation(student.evaluate, [True] * 7 + [False] * 3)
+
+
+@suite.test("evaluate", points=2, name="one drive per seed", hint="once-per-seed", reread="Exercise 4")
+def evaluate_calls(student: Any) -> None:
+    calls: list[int] = []
+
+    def drive(seed: int) -> Any:
+        calls.append(seed)
+        return SimpleNamespace(success=True, perception_ms=np.array([5.0]))
+
+    student.evaluate(drive, range(3, 9))
+    expect(sorted(calls) == list(range(3, 9)), got=calls, expected=list(range(3, 9)), given="seeds 3 to 8")
+
+
+@suite.test("gap", points=4, name="five pairs worked out by hand", reread="Exercise 5.1")
+def gap_by_hand(student: Any) -> None:
+    tools.compare_gap(student.paired_gap, [20.0, 31.0, 44.0, 25.0, 38.0], [21.5, 33.0, 44.5, 27.5, 41.0])
