@@ -88,6 +88,16 @@ def test_a_viewed_cell_is_not_behind_an_obstacle() -> None:
     assert not memory.viewed[FRAME.to_cell(-0.8, 0.0)]
 
 
+@pytest.mark.parametrize("yaw", np.linspace(-3, 3, 9))
+def test_the_next_target_is_never_underfoot(yaw: float) -> None:
+    memory = ViewMemory(FRAME)
+    occupancy = np.zeros(FRAME.shape, dtype=np.int8)
+    memory.look((0.3, -0.2, yaw), occupancy)
+    target = memory.next_target((0.3, -0.2, yaw), occupancy)
+    assert target is not None
+    assert np.hypot(target[0] - 0.3, target[1] + 0.2) > 0.4
+
+
 def test_exploration_visits_all_it_can_reach_and_nothing_else() -> None:
     occupancy = np.full(FRAME.shape, -1, dtype=np.int8)
     inside = FRAME.to_points(np.argwhere(np.ones(FRAME.shape)))

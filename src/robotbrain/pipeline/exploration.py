@@ -21,6 +21,7 @@ class ViewParams:
         reach: distance up to which a marker would be recognised, m.
         clearance: candidates for the next view keep this far from obstacles, m.
         block: candidates are taken from blocks of this many cells a side.
+        underfoot: cells this near to the robot count as viewed, m.
         turn_cost: metres of detour that one radian of turning is worth.
     """
 
@@ -28,6 +29,7 @@ class ViewParams:
     reach: float = 4.5
     clearance: float = 0.3
     block: int = 5
+    underfoot: float = 0.5
     turn_cost: float = 0.35
 
 
@@ -60,12 +62,17 @@ class ViewMemory:
         blocked = (occupancy[rows, columns] >= OCCUPIED_FROM) | ~inside
         visible = ~np.maximum.accumulate(blocked, axis=1)
         self.viewed[rows[visible], columns[visible]] = True
+        # Where the robot stands there is nothing to look for; a target underfoot could never be faced.
+        self._around(self.viewed, pose[0], pose[1], p.underfoot)
 
     def reject(self, x: float, y: float, radius: float = 0.4) -> None:
         """Never propose targets within ``radius`` metres of a point that turned out to be unreachable."""
+        self._around(self._rejected, x, y, radius)
+
+    def _around(self, grid: NDArray[np.bool_], x: float, y: float, radius: float) -> None:
         reach = int(radius / self.frame.resolution)
         row, column = self.frame.to_cell(x, y)
-        self._rejected[max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1] = True
+        grid[max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1] = True
 
     def next_target(self, pose: Pose, occupancy: NDArray[np.int8]) -> tuple[float, float] | None:
         """Return the most worthwhile reachable point that the camera has not viewed, x, y in m; None if all is viewed.

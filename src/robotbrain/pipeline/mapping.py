@@ -60,8 +60,8 @@ class OccupancyMapper:
 
         Args:
             pose: of the lidar in the map frame when the scan was taken.
-            ranges: (N,) m, all around; inf where nothing returned, NaN where the beam is invalid. A lone inf between two
-                returns is taken for a lost echo, not for open space.
+            ranges: (N,) m, all around; inf where nothing returned, NaN where the beam is invalid. A lone inf between
+                two returns is taken for a lost echo, not for open space.
             angles: (N,) rad, counter-clockwise from the lidar's x axis.
         """
         step = self.frame.resolution / 2
