@@ -134,6 +134,19 @@ def test_a_rejected_target_is_not_proposed_again() -> None:
     assert second is not None and second != first
 
 
+def test_a_discarded_track_is_gone_for_good_and_only_it() -> None:
+    tracker = MarkerTracker(confirm=2)
+    for _ in range(3):
+        tracker.add((1.0, 0.0), 1.0)
+    for _ in range(2):
+        tracker.add((5.0, 5.0), 1.0)
+    tracker.discard()
+    assert tracker.estimate() == pytest.approx((5.0, 5.0))
+    for _ in range(9):
+        tracker.add((1.1, 0.1), 1.0)
+    assert tracker.estimate() == pytest.approx((5.0, 5.0))
+
+
 def test_tracker_confirms_converges_and_shrugs_off_strays() -> None:
     rng = np.random.default_rng(0)
     tracker = MarkerTracker(confirm=3)

@@ -120,7 +120,7 @@ class ViewMemory:
         return float(best[0]), float(best[1])
 
 
-@dataclass
+@dataclass(eq=False)
 class _Track:
     position: NDArray[np.float64]
     information: float

@@ -122,9 +122,7 @@ def train(config: TrainConfig, output: Path, *, progress: bool = True) -> dict[s
     begin = time.perf_counter()
     torch.manual_seed(config.seed)
     rng = np.random.default_rng(config.seed)
-    images, labels, _ = render_dataset(
-        range(config.seed, config.seed + config.worlds), config.images_per_world
-    )
+    images, labels, _ = render_dataset(range(config.seed, config.seed + config.worlds), config.images_per_world)
     rendered = time.perf_counter() - begin
     inputs, targets = torch.from_numpy(normalise(images)), torch.from_numpy(labels.astype(np.int64))
     network = build_network(config.width).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -151,9 +149,7 @@ def train(config: TrainConfig, output: Path, *, progress: bool = True) -> dict[s
                 if k % 20 == 0:
                     bar.set_postfix(loss=f"{loss.item():.3f}")
     export(network, output)
-    held_images, held_labels, _ = render_dataset(
-        range(HELD_OUT_SEED, HELD_OUT_SEED + config.held_out_worlds), 4
-    )
+    held_images, held_labels, _ = render_dataset(range(HELD_OUT_SEED, HELD_OUT_SEED + config.held_out_worlds), 4)
     session = onnxruntime.InferenceSession(str(output), providers=["CPUExecutionProvider"])
     iou = evaluate(session, held_images, held_labels)
     parameters = sum(p.numel() for p in network.parameters())

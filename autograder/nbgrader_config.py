@@ -1,0 +1,53 @@
+"""nbgrader's configuration. Run nbgrader in this folder: ``cd autograder && nbgrader autograde lab_integration``."""
+
+import os
+import sys
+from pathlib import Path
+
+from nbgrader.converters import GenerateAssignment
+
+from robotbrain.grading.nbgrader_plugins import CanonicalForm, HealingExporter, ResilientExecute
+
+c = get_config()
+
+HERE = Path(__file__).resolve().parent
+ROOT = HERE.parent
+
+# Where things are. The source and the release lie in the repository, all that belongs to students lies in here.
+c.CourseDirectory.course_id = "robotbrain"
+c.CourseDirectory.root = str(ROOT)
+c.CourseDirectory.source_directory = "solutions"
+c.CourseDirectory.release_directory = "labs"
+c.CourseDirectory.submitted_directory = "autograder/submitted"
+c.CourseDirectory.autograded_directory = "autograder/autograded"
+c.CourseDirectory.feedback_directory = "autograder/feedback"
+c.CourseDirectory.db_url = f"sqlite:///{(HERE / 'gradebook.db').as_posix()}"
+
+# Submissions are read so that a damaged file still gets a grade, and run so that one cell cannot spoil the rest.
+c.Autograde.exporter_class = HealingExporter
+c.ResilientExecute.timeout = 120
+c.ResilientExecute.graded_timeout = 300
+c.ResilientExecute.wall = 900
+c.Autograde.autograde_preprocessors = [
+    ResilientExecute,
+    "nbgrader.preprocessors.IgnorePattern",
+    "nbconvert.preprocessors.ClearMetadataPreprocessor",
+    "nbgrader.preprocessors.LimitOutput",
+    "nbgrader.preprocessors.SaveAutoGrades",
+    "nbgrader.preprocessors.AssignLatePenalties",
+    "nbgrader.preprocessors.CheckCellMetadata",
+]
+c.OverwriteCells.add_missing_cells = True
+
+# A release is stored like every other notebook of the repository: `labs/` is compared byte by byte.
+c.GenerateAssignment.preprocessors = [*GenerateAssignment.preprocessors.default_args[0], CanonicalForm]
+
+# Students see the gaps they are to fill, in words.
+c.ClearSolutions.code_stub = {"python": "# YOUR CODE HERE\nraise NotImplementedError()"}
+# Validate in a student's JupyterLab and the autograder give a cell the same patience.
+c.Execute.timeout = 300
+c.Execute.skip_cells_with_tag = "skip-grading"
+
+# The hidden tests are found here, and nbgrader finds the `alembic` command beside this Python.
+os.environ.setdefault("ROBOTBRAIN_AUTOGRADER", str(HERE))
+os.environ["PATH"] = str(Path(sys.executable).parent) + os.pathsep + os.environ.get("PATH", "")

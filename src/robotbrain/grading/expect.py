@@ -1,0 +1,202 @@
+"""Expectations: what a test says when a student's answer is wrong.
+
+``expect`` and its kin raise :class:`CheckFailure`, whose fields a report lays out as "given, got, expected,
+likely mistake, hint". They are ordinary assertions: pytest understands them too.
+"""
+
+from __future__ import annotations
+
+import reprlib
+from typing import Any
+
+_MISSING: Any = object()
+_LONGEST = 400  # characters of a shown value: more than fits a line, less than hides the message
+
+
+class CheckFailure(AssertionError):  # noqa: N818 - a student's failure, not a program's error
+    """A student's answer is not what the test expects.
+
+    Args:
+        message: one sentence that says what is wrong.
+        given, expected, got: what went in, should have come out, and came out (any object, or ready text).
+        hint: a key of the suite's hints, or the hint itself.
+        misconception: the mistake that most likely leads here.
+        credit: fraction of the test's points kept all the same, in ``[0, 1]``.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        given: Any = _MISSING,
+        expected: Any = _MISSING,
+        got: Any = _MISSING,
+        hint: str = "",
+        misconception: str = "",
+        credit: float = 0.0,
+    ) -> None:
+        super().__init__(message)
+        self.message = message
+        self.given = "" if given is _MISSING else show(given)
+        self.expected = "" if expected is _MISSING else show(expected)
+        self.got = "" if got is _MISSING else show(got)
+        self.hint, self.misconception, self.credit = hint, misconception, credit
+
+
+def show(value: Any, limit: int = _LONGEST) -> str:
+    """Return ``value`` as short readable text; never raises, whatever the object's ``__repr__`` does."""
+    if isinstance(value, str):
+        text = value
+    else:
+        try:
+            text = _show_array(value) if hasattr(value, "shape") and hasattr(value, "dtype") else _REPR.repr(value)
+        except Exception as error:
+            text = f"<{type(value).__name__} whose repr raises {type(error).__name__}>"
+    return text if len(text) <= limit else text[: limit - 1] + "…"
+
+
+class _Repr(reprlib.Repr):
+    """``reprlib`` that trusts a dataclass's own repr: it abbreviates by length, not by depth."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.maxlist = self.maxtuple = self.maxdict = self.maxset = self.maxfrozenset = 12
+        self.maxstring = self.maxother = _LONGEST
+
+    def repr_instance(self, x: Any, level: int) -> str:
+        return repr(x)
+
+
+_REPR = _Repr()
+
+
+def _show_array(value: Any) -> str:
+    import numpy as np
+
+    array = np.asarray(value)
+    body = np.array2string(array, precision=5, threshold=20, edgeitems=3, separator=", ", max_line_width=76)
+    return body if array.ndim == 0 else f"{body}  (shape {array.shape}, {array.dtype})"
+
+
+def fail(
+    message: str,
+    *,
+    given: Any = _MISSING,
+    expected: Any = _MISSING,
+    got: Any = _MISSING,
+    hint: str = "",
+    misconception: str = "",
+    credit: float = 0.0,
+) -> None:
+    """Fail the test with ``message``; the other arguments are those of :class:`CheckFailure`."""
+    raise CheckFailure(
+        message,
+        given=given,
+        expected=expected,
+        got=got,
+        hint=hint,
+        misconception=misconception,
+        credit=credit,
+    )
+
+
+def expect(
+    condition: Any,
+    message: str = "",
+    *,
+    got: Any = _MISSING,
+    expected: Any = _MISSING,
+    given: Any = _MISSING,
+    hint: str = "",
+    misconception: str = "",
+    credit: float = 0.0,
+) -> None:
+    """Fail the test unless ``condition`` is true.
+
+    Args:
+        condition: anything with a truth value. One without (an array of several elements) is a failure of its
+            own that says so, for a student's function often returns an array where a number is due.
+        message: one sentence on what is wrong; without it the report shows ``got`` beside ``expected``.
+        credit: fraction of the test's points kept when this expectation is not met.
+    """
+    try:
+        holds = bool(condition)
+    except Exception as error:
+        holds, message = False, f"the answer has no single truth value ({error})"
+    if not holds:
+        fail(
+            message or "the answer is not the one expected",
+            given=given,
+            expected=expected,
+            got=got,
+            hint=hint,
+            misconception=misconception,
+            credit=credit,
+        )
+
+
+def expect_close(
+    got: Any,
+    expected: Any,
+    *,
+    atol: float = 1e-8,
+    rtol: float = 1e-6,
+    given: Any = _MISSING,
+    hint: str = "",
+    misconception: str = "",
+    credit: float = 0.0,
+    what: str = "the answer",
+) -> None:
+    """Fail the test unless ``got`` equals ``expected`` to within ``atol + rtol * |expected|``, element by element.
+
+    A wrong type, shape, length or a NaN is named as such. Infinities match infinities of the same sign, and a
+    NaN matches where ``expected`` has one.
+    """
+    import numpy as np
+
+    kept = {"given": given, "hint": hint, "misconception": misconception, "credit": credit}
+    target = np.asarray(expected)
+    if got is None:
+        fail(f"{what} is None: does your function return it?", expected=expected, got="None", **kept)
+    try:
+        array = np.asarray(got)
+        if array.dtype == object or array.dtype.kind not in "biufc":
+            raise TypeError
+        numbers = array.astype(complex if array.dtype.kind == "c" else float)
+    except Exception:
+        wanted = "a number" if target.ndim == 0 else f"numbers of shape {target.shape}"
+        fail(
+            f"{what} should be {wanted}, but is of type {type(got).__name__}",
+            expected=expected,
+            got=got,
+            **kept,
+        )
+    if numbers.shape != target.shape:
+        fail(
+            f"{what} has shape {numbers.shape}, but shape {target.shape} is expected",
+            expected=expected,
+            got=got,
+            **kept,
+        )
+    stray = np.isnan(numbers) & ~np.isnan(target)
+    if stray.any():
+        where = "" if numbers.ndim == 0 else f" (first at index {_first(stray)})"
+        fail(f"{what} contains NaN{where}", expected=expected, got=got, **kept)
+    wrong = ~np.isclose(numbers, target, rtol=rtol, atol=atol, equal_nan=True)
+    if wrong.any():
+        if numbers.ndim == 0:
+            fail(f"{what} is not close enough", expected=expected, got=got, **kept)
+        at = _first(wrong)
+        fail(
+            f"{what} differs in {int(wrong.sum())} of {wrong.size} values, first at index {at}: "
+            f"{numbers[at]:.6g} instead of {target[at]:.6g}",
+            expected=expected,
+            got=got,
+            **kept,
+        )
+
+
+def _first(mask: Any) -> tuple[int, ...]:
+    import numpy as np
+
+    return tuple(int(i) for i in np.argwhere(mask)[0])

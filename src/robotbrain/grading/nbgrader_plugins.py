@@ -1,0 +1,102 @@
+"""What the kit puts in place of nbgrader's own classes; the configuration in ``autograder/`` names them.
+
+``ResilientExecute`` replaces ``Execute``; ``HealingExporter`` reads submissions that nbgrader could not. Everything
+else (overwriting of locked cells, the gradebook, formgrader, feedback) stays stock.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import nbformat
+from nbconvert.exporters import NotebookExporter
+from nbformat.notebooknode import NotebookNode
+from nbgrader.preprocessors import NbGraderPreprocessor
+from traitlets import Float, Integer, Unicode
+
+from robotbrain.grading import intake
+from robotbrain.grading.execute import Limits, execute_notebook, make_gradable
+from robotbrain.grading.student import STUDENT_VARIABLE
+from robotbrain.notebooks import canonicalise
+
+
+class ResilientExecute(NbGraderPreprocessor):  # type: ignore[misc]
+    """Runs a notebook so that every graded cell ends with a score and a reason."""
+
+    timeout = Float(Limits.cell_s, help="Seconds an ordinary cell may run.").tag(config=True)
+    graded_timeout = Float(Limits.graded_s, help="Seconds a graded cell may run.").tag(config=True)
+    grace = Float(Limits.grace_s, help="Seconds between interrupt and kill.").tag(config=True)
+    wall = Float(Limits.wall_s, help="Seconds the whole notebook may take.").tag(config=True)
+    output_bytes = Integer(Limits.output_bytes, help="Bytes of output kept of one cell.").tag(config=True)
+    executed_directory = Unicode(
+        "", help="Folder of notebooks already executed by `robotbrain grade-class`: <student>/<notebook>.ipynb."
+    ).tag(config=True)
+
+    def limits(self) -> Limits:
+        """The configured limits."""
+        return Limits(self.timeout, self.graded_timeout, self.grace, self.wall, self.output_bytes)
+
+    def preprocess(self, nb: NotebookNode, resources: dict[str, Any]) -> tuple[NotebookNode, dict[str, Any]]:
+        """Execute ``nb``, or take its outputs from a run of the very same cells."""
+        names = resources.get("nbgrader", {})
+        student, notebook = names.get("student", ""), names.get("notebook", "")
+        path = Path(self.executed_directory) / student / f"{notebook}.ipynb"
+        if self.executed_directory and path.is_file():
+            executed = nbformat.read(path, as_version=4)
+            if take_outputs(nb, executed):
+                return nb, resources
+            self.log.warning("The executed notebook of %s does not match its submission; running it now", student)
+        cwd = Path(resources.get("metadata", {}).get("path") or Path.cwd())
+        run = execute_notebook(nb, cwd=cwd, limits=self.limits(), extra_env={STUDENT_VARIABLE: student})
+        for incident in run.incidents:
+            self.log.warning("%s: %s", student, incident)
+        return nb, resources
+
+
+def take_outputs(nb: NotebookNode, executed: NotebookNode) -> bool:
+    """Copy outputs from ``executed`` into ``nb`` if both have the same code cells; return whether they have."""
+    mine = [c for c in nb.cells if c.cell_type == "code"]
+    theirs = [c for c in executed.cells if c.cell_type == "code"]
+    if [c.source for c in mine] != [c.source for c in theirs]:
+        return False
+    for cell, done in zip(mine, theirs, strict=True):
+        cell.outputs, cell.execution_count = done.outputs, done.execution_count
+        make_gradable(cell)
+    return True
+
+
+class CanonicalForm(NbGraderPreprocessor):  # type: ignore[misc]
+    """Brings a released notebook into the form in which the repository keeps notebooks."""
+
+    def preprocess(self, nb: NotebookNode, resources: dict[str, Any]) -> tuple[NotebookNode, dict[str, Any]]:
+        """Return ``nb`` in canonical form."""
+        return canonicalise(nb), resources
+
+
+class HealingExporter(NotebookExporter):  # type: ignore[misc]
+    """Reads a submission through :mod:`robotbrain.grading.intake`, so that a damaged file still gets a grade."""
+
+    def from_filename(
+        self, filename: str, resources: dict[str, Any] | None = None, **kw: Any
+    ) -> tuple[Any, dict[str, Any]]:
+        """Heal a submitted notebook against the instructor's source; leave other files alone."""
+        source = self._source_of(filename, resources or {})
+        if source is None:
+            return super().from_filename(filename, resources=resources, **kw)  # type: ignore[no-any-return]
+        healed = intake.heal(Path(filename), intake.master_of(source))
+        for repair in healed.repairs:
+            self.log.warning("%s: %s", filename, repair)
+        resources = dict(resources or {})
+        resources["metadata"] = {"name": Path(filename).stem, "path": str(Path(filename).parent)}
+        return self.from_notebook_node(healed.notebook, resources=resources, **kw)  # type: ignore[no-any-return]
+
+    def _source_of(self, filename: str, resources: dict[str, Any]) -> Path | None:
+        converter = self.parent
+        names = resources.get("nbgrader")
+        if names is None or not getattr(converter, "_sanitizing", False):
+            return None
+        course = converter.coursedir
+        folder = Path(course.format_path(course.source_directory, ".", names["assignment"]))
+        path = folder / f"{names['notebook']}.ipynb"
+        return path if path.is_file() else None

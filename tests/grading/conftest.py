@@ -1,0 +1,27 @@
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from robotbrain.grading.suite import AUTOGRADER_VARIABLE, SUITES_VARIABLE
+from tests.grading import toylab
+
+
+@pytest.fixture(scope="session")
+def course_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return toylab.make_course(tmp_path_factory.mktemp("course"))
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _toy_suite(course_root: Path) -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(SUITES_VARIABLE, str(course_root / "suites"))
+        patch.setenv(AUTOGRADER_VARIABLE, str(course_root / "autograder"))
+        yield
+
+
+@pytest.fixture
+def notebook_globals() -> dict[str, object]:
+    return {"__name__": "__main__"}
