@@ -124,6 +124,18 @@ def test_exploration_visits_all_it_can_reach_and_nothing_else() -> None:
     assert reachable.sum() < 0.03 * (occupancy == 0).sum()
 
 
+def test_looking_again_goes_nearer() -> None:
+    occupancy = np.zeros(FRAME.shape, dtype=np.int8)
+    memory = ViewMemory(FRAME)
+    memory.look((-3.0, 0.0, 0.0), occupancy)
+    assert memory.viewed[FRAME.to_cell(1.0, 0.0)]
+    memory.look_again()
+    assert not memory.viewed.any()
+    memory.look((-3.0, 0.0, 0.0), occupancy)
+    assert memory.viewed[FRAME.to_cell(-1.0, 0.0)]
+    assert not memory.viewed[FRAME.to_cell(1.0, 0.0)]
+
+
 def test_a_rejected_target_is_not_proposed_again() -> None:
     occupancy = np.zeros(FRAME.shape, dtype=np.int8)
     memory = ViewMemory(FRAME)

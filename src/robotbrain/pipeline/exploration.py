@@ -44,14 +44,17 @@ class ViewMemory:
     def __init__(self, frame: GridFrame, params: ViewParams | None = None) -> None:
         self.frame = frame
         self.params = params or ViewParams()
+        self.reach = self.params.reach
         self.viewed = np.zeros(frame.shape, dtype=bool)
         self._rejected = np.zeros(frame.shape, dtype=bool)
 
     def look(self, pose: Pose, occupancy: NDArray[np.int8]) -> None:
         """Mark the cells in the camera's field of view that no occupied cell hides."""
         p = self.params
-        angles = pose[2] + np.linspace(-p.half_angle, p.half_angle, 49)
-        along = np.arange(0.0, p.reach, self.frame.resolution)
+        # Dense enough that no cell falls between two rays, even at the far end.
+        rays = int(np.ceil(2 * p.half_angle * self.reach / self.frame.resolution)) + 1
+        angles = pose[2] + np.linspace(-p.half_angle, p.half_angle, rays)
+        along = np.arange(0.0, self.reach, 0.7 * self.frame.resolution)
         points = (
             np.asarray(pose[:2]) + along[None, :, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)[:, None, :]
         )
@@ -64,6 +67,12 @@ class ViewMemory:
         self.viewed[rows[visible], columns[visible]] = True
         # Where the robot stands there is nothing to look for; a target underfoot could never be faced.
         self._around(self.viewed, pose[0], pose[1], p.underfoot)
+
+    def look_again(self) -> None:
+        """Forget what was viewed and trust the camera less far: the marker was missed, so every place needs a closer look."""
+        self.viewed[:] = False
+        self._rejected[:] = False
+        self.reach = max(0.6 * self.reach, 1.5)
 
     def reject(self, x: float, y: float, radius: float = 0.4) -> None:
         """Never propose targets within ``radius`` metres of a point that turned out to be unreachable."""
@@ -172,6 +181,10 @@ class MarkerTracker:
         if best is not None:
             self._tracks.remove(best)
             self._mistakes.append(best.position)
+
+    def forgive(self) -> None:
+        """Take sightings everywhere seriously again."""
+        self._mistakes.clear()
 
     def estimate(self) -> tuple[float, float] | None:
         """Return the position of the track seen most often, x, y in m; None until one is confirmed."""

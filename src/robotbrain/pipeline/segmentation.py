@@ -25,6 +25,9 @@ STD = (0.25, 0.25, 0.25)
 MAT_BELOW, SIGN_ABOVE = 0.08, 0.6
 """The marker is a mat on the floor and a sign that hangs above; what looks like it between these heights, m, is not."""
 
+OBSTACLE_ABOVE = 0.035
+"""Lower than this, m, nothing stops the robot (the lowest boxes are 0.10 m high)."""
+
 SIGN_DEPTH = 0.2
 """Half the depth of the hanging sign, m: its axis lies this far behind the face that the camera sees."""
 
@@ -138,11 +141,12 @@ def ground_points(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return floor points and obstacle points (N, 2) in the base frame, m, within ``max_range``.
 
-    Obstacle points above the robot (0.5 m) are left out; the marker's mat counts as floor.
+    Obstacle points above the robot (0.5 m) are left out, and so are those on the floor: a wrong pixel there, at the edge
+    of the mat, say, would wall off free ground. The marker's mat counts as floor.
     """
     finite = np.isfinite(points[..., 0])
     near = finite & (np.hypot(points[..., 0], points[..., 1]) < max_range)
     low = near & (points[..., 2] < 0.5)
     floor = low & ((mask == FLOOR) | (mask == MARKER)) & (points[..., 2] < 0.1)
-    obstacle = low & (mask == OBSTACLE)
+    obstacle = low & (mask == OBSTACLE) & (points[..., 2] > OBSTACLE_ABOVE)
     return points[floor][:, :2], points[obstacle][:, :2]

@@ -119,12 +119,15 @@ class MissionNode(Node):
             self._target = self._views.next_target(pose, self._occupancy)
             self._target_since = now
         if self._target is None:
+            # All that can be reached was viewed, and there was no marker: it must have been overlooked.
+            self._views.look_again()
+            self._marker.forgive()
             self._look_around(pose)
             return
         self._request(pose, self._target, now)
 
     def _look_around(self, pose: Pose) -> None:
-        """Everything reachable was viewed and there is no marker: turn on, the map may yet grow."""
+        """Turn on the spot while there is no better place to look."""
         path = numpy_to_path(np.array([pose[:2]]), stamp=self.get_clock().now().to_msg())
         path.poses[0].pose.orientation = yaw_to_quaternion(pose[2] + 2.0)
         self._planned_for = None
