@@ -69,7 +69,7 @@ class ViewMemory:
         self._around(self.viewed, pose[0], pose[1], p.underfoot)
 
     def look_again(self) -> None:
-        """Forget what was viewed and trust the camera less far: the marker was missed, so every place needs a closer look."""
+        """Forget what was viewed and trust the camera less far: the marker was missed, so look again, from nearer."""
         self.viewed[:] = False
         self._rejected[:] = False
         self.reach = max(0.6 * self.reach, 1.5)

@@ -141,8 +141,8 @@ def ground_points(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return floor points and obstacle points (N, 2) in the base frame, m, within ``max_range``.
 
-    Obstacle points above the robot (0.5 m) are left out, and so are those on the floor: a wrong pixel there, at the edge
-    of the mat, say, would wall off free ground. The marker's mat counts as floor.
+    Obstacle points above the robot (0.5 m) are left out, and so are those on the floor: a wrong pixel there, at the
+    edge of the mat, say, would wall off free ground. The marker's mat counts as floor.
     """
     finite = np.isfinite(points[..., 0])
     near = finite & (np.hypot(points[..., 0], points[..., 1]) < max_range)

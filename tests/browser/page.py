@@ -1,0 +1,133 @@
+"""JupyterLab as a person at the screen uses it, and a few questions about what it holds."""
+
+from __future__ import annotations
+
+import io
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from PIL import Image
+
+from .server import LabServer, wait_until
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Locator, Page
+
+_STATE = """() => {
+  const widget = window.jupyterapp && window.jupyterapp.shell.currentWidget;
+  const session = widget && widget.sessionContext;
+  if (!widget || !widget.model || !widget.model.cells || !session) return null;
+  const cells = [];
+  for (const cell of widget.model.cells) cells.push({
+    id: cell.id,
+    type: cell.type,
+    count: cell.type === 'code' ? cell.executionCount : null,
+    outputs: cell.type === 'code' ? cell.outputs.toJSON() : [],
+    tags: cell.getMetadata('tags') || [],
+  });
+  const kernel = session.session && session.session.kernel;
+  return {path: widget.context.path, status: kernel ? kernel.status : 'none', cells: cells};
+}"""
+_SHOW = """(id) => {
+  const notebook = window.jupyterapp.shell.currentWidget.content;
+  const index = notebook.widgets.findIndex(cell => cell.model.id === id);
+  notebook.activeCellIndex = index;
+  return notebook.scrollToItem(index, 'start').then(() => index);
+}"""
+
+
+class NotebookPage:
+    """A notebook that is open in JupyterLab.
+
+    Args:
+        page: Playwright's page.
+        server: where it comes from.
+    """
+
+    def __init__(self, page: Page, server: LabServer) -> None:
+        self.page, self.server = page, server
+
+    def open(self, notebook: str, workspace: str) -> NotebookPage:
+        """Open a notebook (path within the course) in a workspace of its own, and wait for its kernel."""
+        self.page.goto(self.server.address(notebook, workspace), wait_until="domcontentloaded")
+        return self.wait_for_kernel(notebook)
+
+    def wait_for_kernel(self, notebook: str) -> NotebookPage:
+        """Wait until the notebook is shown and its kernel is idle."""
+
+        def ready() -> bool:
+            state = self.state()
+            return bool(state and state["path"] == notebook and state["status"] == "idle" and state["cells"])
+
+        wait_until(ready, 120, lambda: f"{notebook} open with an idle kernel; found {self.summary()}")
+        return self
+
+    def state(self) -> dict[str, Any] | None:
+        """The path, kernel status and cells (id, type, count, outputs, tags) of the notebook in front, if there is one."""
+        return self.page.evaluate(_STATE)  # type: ignore[no-any-return]
+
+    def summary(self) -> str:
+        """One line on how far the notebook in front has come."""
+        state = self.state()
+        if state is None:
+            return "no notebook"
+        done = [cell["id"] for cell in state["cells"] if cell["count"]]
+        return f"{state['path']}, kernel {state['status']}, {len(done)} cells run, last {done[-1] if done else '(none)'}"
+
+    def menu(self, *labels: str) -> None:
+        """Choose an entry of the menu bar: ``menu("Run", "Run All Cells")``."""
+        self.page.locator(".jp-MenuBar-anchor, .lm-MenuBar-item").get_by_text(labels[0], exact=True).first.click()
+        for label in labels[1:]:
+            self.page.locator(".lm-Menu-item:visible .lm-Menu-itemLabel").get_by_text(label, exact=True).click()
+
+    def run_all(self, timeout_s: float) -> list[dict[str, Any]]:
+        """Run all cells through the menu, wait until the last one has run, and return the code cells."""
+        self.menu("Run", "Run All Cells")
+
+        def finished() -> list[dict[str, Any]] | None:
+            state = self.state()
+            assert state is not None
+            code = [cell for cell in state["cells"] if cell["type"] == "code"]
+            errors = [cell["id"] for cell in code if any(o["output_type"] == "error" for o in cell["outputs"])]
+            return code if state["status"] == "idle" and (code[-1]["count"] or errors) else None
+
+        return wait_until(finished, timeout_s, lambda: f"all cells run; {self.summary()}", every_s=0.5)
+
+    def show(self, cell_id: str) -> Locator:
+        """Scroll a cell to the top of the screen and return it."""
+        index = self.page.evaluate(_SHOW, cell_id)
+        cell = self.page.locator(f'.jp-NotebookPanel:visible .jp-Cell[data-windowed-list-index="{index}"]')
+        cell.wait_for(state="visible")
+        cell.scroll_into_view_if_needed()
+        return cell
+
+    def save_screenshot(self, name: str) -> None:
+        """Keep a picture of the window where ``ROBOTBRAIN_SCREENSHOTS`` says, if it says."""
+        if folder := os.environ.get("ROBOTBRAIN_SCREENSHOTS"):
+            Path(folder).mkdir(parents=True, exist_ok=True)
+            self.page.screenshot(path=str(Path(folder) / f"{name}.png"))
+
+
+def wait_for_3d_view(cell: Locator, timeout_s: float = 60) -> Locator:
+    """Wait until the 3D view in a cell's output has drawn a scene; return its frame.
+
+    A canvas that nothing was drawn on has one colour; a hall with a robot has hundreds.
+    """
+    frame = cell.locator("iframe")
+    frame.wait_for(state="visible")
+    frame.scroll_into_view_if_needed()
+    canvas = frame.content_frame.locator("canvas").first
+    canvas.wait_for(state="visible", timeout=timeout_s * 1000)
+    seen: list[int] = []
+
+    def drawn() -> bool:
+        pixels = np.asarray(Image.open(io.BytesIO(frame.screenshot())).convert("RGB"))
+        height, width, _ = pixels.shape
+        middle = pixels[height // 4 : -height // 4, width // 4 : -width // 4]  # meshcat's own controls sit in the corner
+        seen.append(len(np.unique(middle.reshape(-1, 3), axis=0)))
+        return seen[-1] >= 100
+
+    wait_until(drawn, timeout_s, lambda: f"a drawn scene in the 3D view; numbers of colours seen: {seen}")
+    return frame

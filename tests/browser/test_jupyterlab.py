@@ -1,0 +1,82 @@
+"""The course in a real JupyterLab in a real browser, as a student meets it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from .page import NotebookPage, wait_for_3d_view
+from .server import CHROMIUM_ARGUMENTS, LabServer, copy_course, serve
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
+
+pytestmark = [pytest.mark.browser, pytest.mark.timeout(900)]
+
+LANDING = "course/00_welcome.ipynb"
+STUB = "labs/lab_integration/lab_integration.ipynb"
+SOLUTION = "solutions/lab_integration/lab_integration.ipynb"
+
+
+@pytest.fixture(scope="module")
+def server(repo: Path, chromium: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LabServer]:
+    scratch = tmp_path_factory.mktemp("jupyterlab")
+    with serve(copy_course(repo, scratch / "my course"), scratch) as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def browser(chromium: str) -> Iterator[Browser]:
+    sync_api = pytest.importorskip("playwright.sync_api")
+    with sync_api.sync_playwright() as playwright:
+        running = playwright.chromium.launch(executable_path=chromium, args=list(CHROMIUM_ARGUMENTS))
+        yield running
+        running.close()
+
+
+@pytest.fixture
+def notebook(browser: Browser, server: LabServer) -> Iterator[NotebookPage]:
+    context = browser.new_context(viewport={"width": 1400, "height": 900})
+    yield NotebookPage(context.new_page(), server)
+    context.close()
+
+
+def test_robotbrain_lab_opens_the_landing_notebook_and_its_cell_drives_in_3d(notebook: NotebookPage) -> None:
+    notebook.page.goto(notebook.server.address())
+    notebook.wait_for_kernel(LANDING)
+    assert notebook.page.locator(".jp-Dialog").count() == 0
+    notebook.save_screenshot("landing")
+    cells = notebook.run_all(timeout_s=120)
+    assert [c["id"] for c in cells if any(o["output_type"] == "error" for o in c["outputs"])] == []
+    wait_for_3d_view(notebook.show("try"))
+    notebook.save_screenshot("landing_replay")
+    links = notebook.page.locator(".jp-MarkdownOutput a", has_text="Lab: put a brain together")
+    links.first.click()
+    notebook.wait_for_kernel(STUB)
+
+
+def test_validate_button_says_what_is_wrong_with_an_empty_lab(notebook: NotebookPage) -> None:
+    notebook.open(STUB, "validate")
+    notebook.page.locator(".jp-NotebookPanel:visible .jp-NotebookPanel-toolbar").get_by_text("Validate").click()
+    dialog = notebook.page.locator(".jp-Dialog")
+    dialog.wait_for(state="visible", timeout=240_000)
+    text = dialog.inner_text()
+    notebook.save_screenshot("validate_stub")
+    assert "The following cell failed" in text, text
+    for exercise in ("1.1 What the network eats", "2.2 A*", "5.1 The gap"):
+        assert f"{exercise}: 0 of " in text, f"{exercise} is missing in:\n{text}"
+    assert "astar is not written yet" in text
+    assert "Traceback" not in text
+
+
+def test_solved_lab_runs_to_the_end_and_shows_its_drives_in_3d(notebook: NotebookPage) -> None:
+    notebook.open(SOLUTION, "solution")
+    cells = notebook.run_all(timeout_s=480)
+    assert [c["id"] for c in cells if any(o["output_type"] == "error" for o in c["outputs"])] == []
+    assert [c["id"] for c in cells if not c["count"]] == []
+    for cell_id in ("meet-replay", "drive-mine"):
+        wait_for_3d_view(notebook.show(cell_id))
+        notebook.save_screenshot(f"solution_{cell_id}")
