@@ -1,8 +1,12 @@
 """``robotbrain lab``: JupyterLab on the course, with nbgrader's Validate button ready to use.
 
-The command changes nothing outside the process it runs in: what nbgrader and the Jupyter server need to know stands in
-``jupyter_config/`` beside this file, which is put first on Jupyter's search path. The user's own theme, shortcuts and
-other settings apply as ever.
+What nbgrader and JupyterLab need to know stands in ``jupyter_config/`` beside this file, which is put first on
+Jupyter's search path for this one server. Nothing of the user's own configuration is changed, and their theme and
+shortcuts apply. In that folder,
+
+- ``nbgrader_config.json`` gives Validate the same patience as grading, and lets it pass over cells that only show;
+- ``jupyter_server_config.d`` turns on nbgrader's extensions for students, whatever the user turned off elsewhere;
+- ``labconfig`` hides what is for instructors, and JupyterLab's question about news: a course opens with the course.
 """
 
 from __future__ import annotations
@@ -57,9 +61,6 @@ def server_arguments(course: Path, *, port: int | None = None, browser: bool = T
         f"--LabApp.default_url=/lab/tree/{LANDING}",
         # Tabs of the user's other projects would not be found in here, nor these in there.
         f"--LabApp.workspaces_dir={_workspaces()}",
-        # The first thing a student sees is the course, not a question about news; and nothing is fetched.
-        "--LabApp.news_url=None",
-        "--LabApp.check_for_updates_class=jupyterlab.NeverCheckForUpdate",
     ]
     if port is not None:
         arguments += [f"--ServerApp.port={port}", "--ServerApp.port_retries=0"]

@@ -15,31 +15,31 @@ from .server import LabServer, wait_until
 if TYPE_CHECKING:
     from playwright.sync_api import Locator, Page
 
-_STATE = """() => {
-  const widget = window.jupyterapp && window.jupyterapp.shell.currentWidget;
-  const session = widget && widget.sessionContext;
-  if (!widget || !widget.model || !widget.model.cells || !session) return null;
+_FIND = "(path) => [...window.jupyterapp.shell.widgets('main')].find(w => w.context && w.context.path === path)"
+_STATE = f"""(path) => {{
+  const widget = window.jupyterapp && ({_FIND})(path);
   const cells = [];
-  for (const cell of widget.model.cells) cells.push({
+  if (!widget || !widget.model || !widget.context.isReady) return null;
+  for (const cell of widget.model.cells) cells.push({{
     id: cell.id,
     type: cell.type,
     count: cell.type === 'code' ? cell.executionCount : null,
     outputs: cell.type === 'code' ? cell.outputs.toJSON() : [],
-    tags: cell.getMetadata('tags') || [],
-  });
-  const kernel = session.session && session.session.kernel;
-  return {path: widget.context.path, status: kernel ? kernel.status : 'none', cells: cells};
-}"""
-_SHOW = """(id) => {
-  const notebook = window.jupyterapp.shell.currentWidget.content;
+  }});
+  const session = widget.sessionContext.session;
+  return {{status: session && session.kernel ? session.kernel.status : 'none', cells: cells}};
+}}"""
+_SHOW = f"""async ([path, id]) => {{
+  const notebook = ({_FIND})(path).content;
   const index = notebook.widgets.findIndex(cell => cell.model.id === id);
   notebook.activeCellIndex = index;
-  return notebook.scrollToItem(index, 'start').then(() => index);
-}"""
+  await notebook.scrollToItem(index, 'start');
+  return index;
+}}"""
 
 
 class NotebookPage:
-    """A notebook that is open in JupyterLab.
+    """A window of JupyterLab with a notebook in front.
 
     Args:
         page: Playwright's page.
@@ -47,34 +47,37 @@ class NotebookPage:
     """
 
     def __init__(self, page: Page, server: LabServer) -> None:
-        self.page, self.server = page, server
+        self.page, self.server, self.path = page, server, ""
 
-    def open(self, notebook: str, workspace: str) -> NotebookPage:
-        """Open a notebook (path within the course) in a workspace of its own, and wait for its kernel."""
-        self.page.goto(self.server.address(notebook, workspace), wait_until="domcontentloaded")
-        return self.wait_for_kernel(notebook)
+    def open(self, path: str, workspace: str) -> None:
+        """Open the notebook at ``path`` (within the course) in a workspace of its own; wait until it can be used."""
+        self.page.goto(self.server.address(path, workspace), wait_until="domcontentloaded")
+        self.wait_for(path)
 
-    def wait_for_kernel(self, notebook: str) -> NotebookPage:
-        """Wait until the notebook is shown and its kernel is idle."""
+    def wait_for(self, path: str) -> None:
+        """Wait until the notebook at ``path`` is open and its kernel idle, and bring it to the front."""
+        self.path = path
 
         def ready() -> bool:
             state = self.state()
-            return bool(state and state["path"] == notebook and state["status"] == "idle" and state["cells"])
+            return bool(state and state["status"] == "idle" and state["cells"])
 
-        wait_until(ready, 120, lambda: f"{notebook} open with an idle kernel; found {self.summary()}")
-        return self
+        wait_until(ready, 120, lambda: f"an idle kernel; {self.summary()}")
+        # A notebook that was opened by its address gets the focus late or never; menus act on the one that has it.
+        self.page.locator(f'.lm-DockPanel-tabBar .lm-TabBar-tab[title*="{path}"]').click()
+        self.page.locator(".lm-TabBar-tab.jp-mod-current").get_by_text(Path(path).name).wait_for()
 
     def state(self) -> dict[str, Any] | None:
-        """The path, kernel status and cells (id, type, count, outputs, tags) of the notebook in front, if there is one."""
-        return self.page.evaluate(_STATE)  # type: ignore[no-any-return]
+        """The kernel's status and the cells (id, type, count, outputs) of the notebook, once it is loaded."""
+        return self.page.evaluate(_STATE, self.path)  # type: ignore[no-any-return]
 
     def summary(self) -> str:
-        """One line on how far the notebook in front has come."""
+        """One line on how far the notebook has come."""
         state = self.state()
         if state is None:
-            return "no notebook"
+            return f"{self.path} is not open"
         done = [cell["id"] for cell in state["cells"] if cell["count"]]
-        return f"{state['path']}, kernel {state['status']}, {len(done)} cells run, last {done[-1] if done else '(none)'}"
+        return f"{self.path}: kernel {state['status']}, {len(done)} cells run, last {done[-1] if done else '(none)'}"
 
     def menu(self, *labels: str) -> None:
         """Choose an entry of the menu bar: ``menu("Run", "Run All Cells")``."""
@@ -97,7 +100,7 @@ class NotebookPage:
 
     def show(self, cell_id: str) -> Locator:
         """Scroll a cell to the top of the screen and return it."""
-        index = self.page.evaluate(_SHOW, cell_id)
+        index = self.page.evaluate(_SHOW, [self.path, cell_id])
         cell = self.page.locator(f'.jp-NotebookPanel:visible .jp-Cell[data-windowed-list-index="{index}"]')
         cell.wait_for(state="visible")
         cell.scroll_into_view_if_needed()
@@ -125,7 +128,9 @@ def wait_for_3d_view(cell: Locator, timeout_s: float = 60) -> Locator:
     def drawn() -> bool:
         pixels = np.asarray(Image.open(io.BytesIO(frame.screenshot())).convert("RGB"))
         height, width, _ = pixels.shape
-        middle = pixels[height // 4 : -height // 4, width // 4 : -width // 4]  # meshcat's own controls sit in the corner
+        middle = pixels[
+            height // 4 : -height // 4, width // 4 : -width // 4
+        ]  # meshcat's own controls sit in the corner
         seen.append(len(np.unique(middle.reshape(-1, 3), axis=0)))
         return seen[-1] >= 100
 

@@ -22,7 +22,6 @@ import psutil
 T = TypeVar("T")
 
 TOKEN = "browser-test"
-DEV = "import sys; from robotbrain import cli; cli.COMMANDS.setdefault('lab', cli.Command('robotbrain.jupyter','')); sys.exit(cli.main())"
 CHROMIUM_ARGUMENTS = (
     "--no-sandbox",
     "--disable-gpu",
@@ -73,7 +72,17 @@ def serve(course: Path, scratch: Path) -> Iterator[LabServer]:
     home = _home(scratch)
     port = _free_port()
     log = scratch / "jupyterlab.log"
-    command = [sys.executable, "-c", DEV, "lab", "--no-browser", "--port", str(port), "--directory", str(course)]
+    command = [
+        sys.executable,
+        "-m",
+        "robotbrain.cli",
+        "lab",
+        "--no-browser",
+        "--port",
+        str(port),
+        "--directory",
+        str(course),
+    ]
     with log.open("wb") as output:
         process = psutil.Popen(command, env=_environment(home), cwd=scratch, stdout=output, stderr=subprocess.STDOUT)
     url = f"http://127.0.0.1:{port}"
@@ -117,7 +126,9 @@ def _home(scratch: Path) -> Path:
 
 
 def _environment(home: Path) -> dict[str, str]:
-    kept = {k: v for k, v in os.environ.items() if not k.startswith(("JUPYTER", "ROBOTBRAIN", "NBGRADER", "MPLBACKEND"))}
+    kept = {
+        k: v for k, v in os.environ.items() if not k.startswith(("JUPYTER", "ROBOTBRAIN", "NBGRADER", "MPLBACKEND"))
+    }
     return kept | {
         "HOME": str(home),
         "USERPROFILE": str(home),

@@ -38,15 +38,17 @@ def browser(chromium: str) -> Iterator[Browser]:
 
 
 @pytest.fixture
-def notebook(browser: Browser, server: LabServer) -> Iterator[NotebookPage]:
+def notebook(browser: Browser, server: LabServer, request: pytest.FixtureRequest) -> Iterator[NotebookPage]:
     context = browser.new_context(viewport={"width": 1400, "height": 900})
-    yield NotebookPage(context.new_page(), server)
+    opened = NotebookPage(context.new_page(), server)
+    yield opened
+    opened.save_screenshot(f"last_{request.node.name}")
     context.close()
 
 
 def test_robotbrain_lab_opens_the_landing_notebook_and_its_cell_drives_in_3d(notebook: NotebookPage) -> None:
     notebook.page.goto(notebook.server.address())
-    notebook.wait_for_kernel(LANDING)
+    notebook.wait_for(LANDING)
     assert notebook.page.locator(".jp-Dialog").count() == 0
     notebook.save_screenshot("landing")
     cells = notebook.run_all(timeout_s=120)
@@ -55,7 +57,7 @@ def test_robotbrain_lab_opens_the_landing_notebook_and_its_cell_drives_in_3d(not
     notebook.save_screenshot("landing_replay")
     links = notebook.page.locator(".jp-MarkdownOutput a", has_text="Lab: put a brain together")
     links.first.click()
-    notebook.wait_for_kernel(STUB)
+    notebook.wait_for(STUB)
 
 
 def test_validate_button_says_what_is_wrong_with_an_empty_lab(notebook: NotebookPage) -> None:

@@ -62,7 +62,7 @@ class RunResult:
         plans: (time s, (N, 2) points in the map frame) of every path handed to the controller.
         marker: the goal position that the brain believed in at the end, in the map frame; None if it never had one.
         box_poses: (T, boxes, 3) x, y, yaw of the movable boxes at the times of ``trajectory``.
-        wall_seconds: real time the run took.
+        wall_seconds: real time the run took, without setting up.
         world: where it happened.
     """
 
@@ -209,7 +209,6 @@ def drive(
     from robotbrain.ros.record import DecisionLog
     from robotbrain.sim import RobotSim, generate_world
 
-    began = time.perf_counter()
     if robot not in ("nominal", "surrogate"):
         raise InputError("robot", given=robot, expected="'nominal' or 'surrogate'", fix="Choose one of the two.")
     chosen = load_profile(profile) if isinstance(profile, str) else profile
@@ -231,7 +230,9 @@ def drive(
         RobotNode(sim)
         for make in make_parts(chosen, sim, model, parts).values():
             make()
+        began = time.perf_counter()
         reason, success = _run(context, sim, watch, time_limit)
+        wall_seconds = time.perf_counter() - began
     context.try_shutdown()
     return RunResult(
         seed=world.spec.seed,
@@ -250,7 +251,7 @@ def drive(
         plans=tuple(watch.plans),
         marker=watch.marker,
         box_poses=np.array(watch.boxes),
-        wall_seconds=time.perf_counter() - began,
+        wall_seconds=wall_seconds,
         world=world,
     )
 

@@ -9,6 +9,7 @@ point-to-line metric", ICRA 2008.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,25 +77,28 @@ class PoseFilter:
         if dt <= 0:
             return
         p = self.params
-        turn = (gyro_rate - self.state[3]) * dt
-        middle = self.state[2] + turn / 2
-        cos, sin = np.cos(middle), np.sin(middle)
+        turn = (gyro_rate - float(self.state[3])) * dt
+        middle = float(self.state[2]) + turn / 2
+        cos, sin = math.cos(middle), math.sin(middle)
         self.state[0] += travel * cos
         self.state[1] += travel * sin
-        self.state[2] = wrap(self.state[2] + turn)
-        jacobian = np.eye(4)
-        jacobian[0, 2], jacobian[1, 2] = -travel * sin, travel * cos
-        jacobian[0, 3], jacobian[1, 3] = travel * sin * dt / 2, -travel * cos * dt / 2
-        jacobian[2, 3] = -dt
+        self.state[2] = wrap(float(self.state[2]) + turn)
+        jacobian = np.array(
+            [
+                [1.0, 0.0, -travel * sin, travel * sin * dt / 2],
+                [0.0, 1.0, travel * cos, -travel * cos * dt / 2],
+                [0.0, 0.0, 1.0, -dt],
+                [0.0, 0.0, 0.0, 1.0],
+            ]
+        )
         along = p.wheel_noise**2 * abs(travel)
         yaw = p.gyro_noise**2 * dt + (p.slip_noise * turn) ** 2
         # Travel acts along the heading; half of the yaw noise bends the step.
-        spread = np.zeros((4, 3))
-        spread[:2, 0] = cos, sin
-        spread[:3, 1] = -travel * sin / 2, travel * cos / 2, 1.0
-        spread[3, 2] = 1.0
-        noise = np.diag([along, yaw, p.bias_walk**2 * dt])
-        self.covariance = jacobian @ self.covariance @ jacobian.T + spread @ noise @ spread.T
+        spread = np.array(
+            [[cos, -travel * sin / 2, 0.0], [sin, travel * cos / 2, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+        )
+        noise = np.array([along, yaw, p.bias_walk**2 * dt])
+        self.covariance = jacobian @ self.covariance @ jacobian.T + (spread * noise) @ spread.T
 
     def observe_standstill(self, gyro_rate: float) -> None:
         """Use a gyro reading taken while the wheels stand still: it shows the bias alone."""
@@ -212,7 +216,7 @@ class ScanMatcher:
             step = np.linalg.solve(hessian + 1e-6 * np.eye(3), -(jacobian * weight[:, None]).T @ residual)
             pose += step
             reject = max(0.1, reject * 0.7)
-            if np.abs(step[:2]).max() < 2e-4 and abs(step[2]) < 1e-4:
+            if np.abs(step[:2]).max() < 5e-4 and abs(step[2]) < 3e-4:
                 break
         rms = float(np.sqrt((residual**2).mean()))
         # A floor under the covariance: neighbouring beams share their errors (normals, discretisation).

@@ -91,7 +91,7 @@ class ViewMemory:
         """
         p = self.params
         known = occupancy != UNKNOWN
-        rows, columns = np.nonzero(known)
+        rows, columns = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
         if rows.size == 0:
             return None
         top, left = int(rows.min()), int(columns.min())

@@ -54,6 +54,7 @@ class OccupancyMapper:
         self._camera = np.zeros(frame.shape, dtype=np.float32)
         self._lidar_seen = np.zeros(frame.shape, dtype=bool)
         self._camera_seen = np.zeros(frame.shape, dtype=bool)
+        self._owner = np.zeros(frame.shape[0] * frame.shape[1], dtype=np.int64)
 
     def add_scan(self, pose: Pose, ranges: NDArray[np.float64], angles: NDArray[np.float64]) -> None:
         """Add one lidar scan.
@@ -64,7 +65,7 @@ class OccupancyMapper:
                 two returns is taken for a lost echo, not for open space.
             angles: (N,) rad, counter-clockwise from the lidar's x axis.
         """
-        step = self.frame.resolution / 2
+        step = 0.7 * self.frame.resolution
         silent = np.isinf(ranges)
         lost = silent & ~np.roll(silent, 1) & ~np.roll(silent, -1)
         ranges = np.where(lost, np.nan, ranges)
@@ -114,12 +115,15 @@ class OccupancyMapper:
     ) -> None:
         """Count each cell once per observation; an occupied verdict wins over a free one."""
         cells_free, cells_occupied = self._flat(free), self._flat(occupied)
-        change = np.zeros(layer.size, dtype=np.float32)
-        change[cells_free] = -miss
-        change[cells_occupied] = hit
-        touched = np.flatnonzero(change)
+        cells = np.concatenate([cells_free, cells_occupied])
+        order = np.arange(len(cells))
+        # Every cell remembers who wrote last; obstacles write after free space, so they win, and each cell counts once.
+        self._owner[cells] = order
+        last = self._owner[cells] == order
+        touched = cells[last]
+        change = np.where(order[last] < len(cells_free), np.float32(-miss), np.float32(hit))
         flat = layer.reshape(-1)
-        flat[touched] = np.clip(flat[touched] + change[touched], -self.params.limit, self.params.limit)
+        flat[touched] = np.clip(flat[touched] + change, -self.params.limit, self.params.limit)
         seen.reshape(-1)[touched] = True
 
     def _flat(self, points: NDArray[np.float64]) -> NDArray[np.intp]:

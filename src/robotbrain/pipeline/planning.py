@@ -368,7 +368,8 @@ def _crop(
 ) -> tuple[NDArray[np.int8], GridFrame]:
     """Cut the grid to what is known, the given points and a margin of 1 m: planning takes time by the cell."""
     margin = int(1.0 / frame.resolution)
-    rows, columns = np.nonzero(grid != UNKNOWN)
+    known = grid != UNKNOWN
+    rows, columns = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
     wanted = np.array([frame.to_cell(*point) for point in points])
     all_rows = np.concatenate([rows, wanted[:, 0]])
     all_columns = np.concatenate([columns, wanted[:, 1]])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import math
+import sys
 from array import array
 from typing import Any, NamedTuple
 
@@ -34,7 +35,9 @@ IMAGE_ENCODINGS: dict[str, tuple[str, int]] = {
 def msg_class(typename: str) -> Any:
     """Return the class of ``pkg/msg/Name`` or ``pkg/srv/Name``, the kit's or genuine rclpy's."""
     package, kind, name = typename.split("/")
-    return getattr(importlib.import_module(f"{package}.{kind}"), name)
+    path = f"{package}.{kind}"
+    # Conversions run for every message: skip the import system where the package is already there.
+    return getattr(sys.modules.get(path) or importlib.import_module(path), name)
 
 
 # ---------------------------------------------------------------- time and headers

@@ -22,6 +22,13 @@ SCAN_MAX_AGE, POINTS_MAX_AGE = 0.5, 2.0
 """How long obstacles seen by the lidar and by the camera are remembered, s."""
 
 
+def thin_out(points: NDArray[np.float64], spacing: float = 0.04) -> NDArray[np.float64]:
+    """Return the middles of the squares of side ``spacing`` (m) that hold any of the (N, 2) points."""
+    squares = np.floor(points / spacing).astype(np.int64)
+    _, first = np.unique(squares[:, 0] * 100_003 + squares[:, 1], return_index=True)
+    return np.asarray((squares[first] + 0.5) * spacing, dtype=np.float64)
+
+
 @dataclass(frozen=True)
 class _Sighting:
     stamp_ns: int
@@ -76,7 +83,7 @@ class ControllerNode(Node):
     def _on_points(self, msg: PointCloud2) -> None:
         points = cloud_to_points(msg).astype(np.float64)
         local = points[points[:, 2] != FLOOR_LABEL, :2]
-        local = local[np.hypot(local[:, 0], local[:, 1]) < 1.5]
+        local = thin_out(local[np.hypot(local[:, 0], local[:, 1]) < 1.5])
         stamp = time_to_ns(msg.header.stamp)
         if len(local):
             self._waiting.add(stamp, lambda pose: self._seen.append(_Sighting(stamp, transform(pose, local))))

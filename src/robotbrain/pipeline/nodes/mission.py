@@ -20,7 +20,7 @@ from robotbrain.pipeline.nodes.mapper import Waiting
 from robotbrain.ros.conversions import numpy_to_path, quaternion_to_yaw, time_to_ns, yaw_to_quaternion
 
 RATE_HZ = 4.0
-REPLAN_AFTER = 1.0
+REPLAN_AFTER = 1.5
 """A path is planned again after this long, s: the map has grown."""
 GIVE_UP_AFTER = 8.0
 """A target that has not been viewed after this long is dropped, s."""

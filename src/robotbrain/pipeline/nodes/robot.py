@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable
 
 import numpy as np
@@ -14,7 +13,7 @@ from sensor_msgs.msg import CameraInfo, Image, Imu, JointState, LaserScan
 from robotbrain.ros.conversions import ns_to_time, numpy_to_image
 from robotbrain.sim import RobotSim
 
-IMU_HZ, WHEELS_HZ, SCAN_HZ, CAMERA_HZ = 100.0, 50.0, 10.0, 10.0
+IMU_HZ, WHEELS_HZ, SCAN_HZ, CAMERA_HZ = 50.0, 50.0, 10.0, 10.0
 WHEELS = ("left_wheel_joint", "right_wheel_joint")
 
 
@@ -28,7 +27,6 @@ class RobotNode(Node):
     def __init__(self, sim: RobotSim) -> None:
         super().__init__("robot")
         self._sim = sim
-        self._on_the_way: deque[tuple[int, Callable[[], None]]] = deque()
         self._imu_pub = self.create_publisher(Imu, "imu", qos_profile_sensor_data)
         self._wheel_pub = self.create_publisher(JointState, "joint_states", 10)
         self._scan_pub = self.create_publisher(LaserScan, "scan", 10)
@@ -36,11 +34,10 @@ class RobotNode(Node):
         self._depth_pub = self.create_publisher(Image, "camera/depth", 10)
         self._info_pub = self.create_publisher(CameraInfo, "camera/camera_info", 10)
         self.create_subscription(Twist, "cmd_vel", self._on_command, 1)
+        self.create_timer(1.0 / IMU_HZ, self._imu)
         self.create_timer(1.0 / WHEELS_HZ, self._wheels)
         self.create_timer(1.0 / SCAN_HZ, self._scan)
         self.create_timer(1.0 / CAMERA_HZ, self._camera)
-        # Last, so that what was read at this moment leaves at this moment.
-        self.create_timer(1.0 / IMU_HZ, self._imu_and_deliveries)
 
     def _advance(self) -> None:
         self._sim.advance_to(self.get_clock().now().nanoseconds)
@@ -49,7 +46,7 @@ class RobotNode(Node):
         self._advance()
         self._sim.set_twist(float(msg.linear.x), float(msg.angular.z))
 
-    def _imu_and_deliveries(self) -> None:
+    def _imu(self) -> None:
         self._advance()
         reading = self._sim.read_imu()
         msg = Imu()
@@ -60,9 +57,6 @@ class RobotNode(Node):
         # The unit has no orientation estimate: sensor_msgs/Imu says so by -1.
         msg.orientation_covariance[0] = -1.0
         self._imu_pub.publish(msg)
-        now = self._sim.now_ns
-        while self._on_the_way and self._on_the_way[0][0] <= now:
-            self._on_the_way.popleft()[1]()
 
     def _wheels(self) -> None:
         self._advance()
@@ -113,7 +107,15 @@ class RobotNode(Node):
         self._deliver(reading.available_ns, publish)
 
     def _deliver(self, available_ns: int, publish: Callable[[], None]) -> None:
-        if available_ns <= self._sim.now_ns:
+        """Publish now, or once the sensor's own latency has passed."""
+        delay_ns = available_ns - self._sim.now_ns
+        if delay_ns <= 0:
             publish()
-        else:
-            self._on_the_way.append((available_ns, publish))
+            return
+
+        def fire() -> None:
+            timer.cancel()
+            self.destroy_timer(timer)
+            publish()
+
+        timer = self.create_timer(delay_ns * 1e-9, fire)
