@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-all lint format lab labs train bench mutation-test clean
+.PHONY: help install demo test lint format lab labs train bench proof-drive mutation-test clean
 
 help:  ## Show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-15s %s\n", $$1, $$2}'
@@ -45,8 +45,15 @@ labs: $(STAMP)  ## Generate labs/ from solutions/
 train: $(STAMP)  ## Train the perception network again (a few minutes) and report its figure
 	$(BIN)/robotbrain train segmentation
 
+proof-drive: $(STAMP)  ## Drive 100 unseen worlds (about ten minutes)
+	$(BIN)/python benchmarks/drive_success.py
+
+mutation-test: $(STAMP)  ## Test the tests of the lab with named wrong solutions
+	$(BIN)/robotbrain mutation-test lab_integration --jobs 2
+
 bench: $(STAMP)  ## Run the benchmarks; each prints one table
-	for script in benchmarks/*.py; do $(BIN)/python $$script; done
+	$(BIN)/python benchmarks/ros_rate.py
+	$(BIN)/python benchmarks/sim_rate.py
 
 clean:  ## Remove .venv, caches and generated pages
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache demo build dist

@@ -1,0 +1,168 @@
+"""The whole brain in simulated time: it arrives, it repeats, it needs its eyes, and its parts can be replaced."""
+
+from __future__ import annotations
+
+import gc
+from types import FunctionType, MethodType, ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from robotbrain.errors import InputError
+from robotbrain.pipeline.brain import GOAL_RADIUS, drive
+from robotbrain.pipeline.nodes.controller import thin_out
+from robotbrain.pipeline.nodes.mission import MissionNode
+from robotbrain.pipeline.nodes.perception import PerceptionNode
+from robotbrain.pipeline.nodes.planner import PlannerNode
+from robotbrain.ros import CallbackError, SimContext
+from robotbrain.sim import RobotSim, generate_world, to_child
+
+
+@pytest.mark.parametrize(("seed", "robot"), [(101, "nominal"), (102, "nominal"), (103, "surrogate")])
+def test_the_reference_brain_arrives_and_touches_nothing(seed: int, robot: Any) -> None:
+    run = drive(seed, robot=robot)
+    assert run.success, run.reason
+    assert run.goal_distance < GOAL_RADIUS and not run.collisions
+    assert run.marker is not None
+    # the judge's verdict agrees with the recorded path, and the brain's belief with the truth
+    world = generate_world(seed)
+    assert np.hypot(run.trajectory[-1, 1] - world.goal.x, run.trajectory[-1, 2] - world.goal.y) < GOAL_RADIUS
+    goal = to_child(world.start, np.array([[world.goal.x, world.goal.y]]))[0]
+    assert np.hypot(*(goal - run.marker)) < GOAL_RADIUS
+    steps = np.linalg.norm(np.diff(run.trajectory[:, 1:3], axis=0), axis=1)
+    assert steps.sum() == pytest.approx(run.path_length, rel=0.1)
+
+
+def test_one_seed_gives_one_log_and_two_seeds_two() -> None:
+    digests = [drive(seed, time_limit=4.0).log_sha256 for seed in (5, 5, 6)]
+    assert digests[0] == digests[1] != digests[2]
+
+
+def test_a_slower_jetson_answers_later_by_what_its_profile_says() -> None:
+    fast = drive(5, time_limit=3.0, profile="agx-orin-64gb")
+    slow = drive(5, time_limit=3.0, profile="nano-4gb")
+    # inference and the callback's own CPU time, nothing waits: 0.9 + 1.75 ms and 12 + 10 ms
+    assert np.median(fast.perception_ms) == pytest.approx(0.9 + 1.75, abs=1e-6)
+    assert np.median(slow.perception_ms) == pytest.approx(12.0 + 10.0, abs=1e-6)
+    assert fast.log_sha256 != slow.log_sha256
+
+
+def blind(seed: int) -> type[PerceptionNode]:
+    class Blind(PerceptionNode):
+        """Sees noise where the network would have answered."""
+
+        rng = np.random.default_rng(seed)
+
+        def segment(self, image: np.ndarray) -> np.ndarray:
+            return self.rng.integers(0, 4, image.shape[:2]).astype(np.uint8)
+
+    return Blind
+
+
+def test_without_the_network_the_goal_is_not_found() -> None:
+    sim = RobotSim(generate_world(0))
+    mount = sim.camera.extrinsics
+
+    def successes(seed: int) -> bool:
+        from robotbrain.jetson import OnnxEngine
+        from robotbrain.pipeline.brain import default_model
+
+        def make() -> PerceptionNode:
+            return blind(seed)(OnnxEngine(default_model()), (mount.x, mount.y, mount.z, mount.pitch))
+
+        return drive(seed, parts={"perception": make}, time_limit=40.0).success
+
+    assert sum(successes(seed) for seed in (101, 102, 103)) == 0
+
+
+def reachable(root: Any) -> set[int]:
+    """Ids of every object that can be reached from ``root`` without passing through ROS or a module."""
+    seen: set[int] = set()
+    todo = [root]
+    while todo:
+        thing = todo.pop()
+        if id(thing) in seen or isinstance(thing, ModuleType | SimContext | type):
+            continue
+        seen.add(id(thing))
+        if isinstance(thing, FunctionType):
+            todo += [c.cell_contents for c in thing.__closure__ or ()]
+        elif isinstance(thing, MethodType):
+            todo += [thing.__self__, thing.__func__]
+        elif type(thing).__module__.startswith("robotbrain.ros") and not hasattr(thing, "get_name"):
+            continue
+        else:
+            todo += gc.get_referents(thing)
+    return seen
+
+
+def test_no_node_can_reach_the_truth() -> None:
+    from robotbrain.jetson import load_profile
+    from robotbrain.pipeline.brain import make_parts
+    from robotbrain.pipeline.nodes.robot import RobotNode
+
+    sim = RobotSim(generate_world(1))
+    context = SimContext()
+    with context.as_default():
+        robot = RobotNode(sim)
+        assert id(sim) in reachable(vars(robot))  # the search finds it where it is
+        for role, make in make_parts(load_profile("nano-4gb"), sim).items():
+            node = make()
+            own = {k: v for k, v in vars(node).items() if "context" not in k and "executor" not in k}
+            found = reachable(own)
+            assert id(sim) not in found and id(sim.truth) not in found, role
+            assert id(sim.world) not in found, role
+
+
+def test_a_students_node_takes_the_place_of_ours_and_its_errors_name_it() -> None:
+    class Broken(PlannerNode):
+        def _plan(self, request: Any, response: Any) -> Any:
+            raise ZeroDivisionError("student's mistake")
+
+    with pytest.raises(CallbackError, match="/planner") as caught:
+        drive(5, parts={"planner": Broken}, time_limit=10.0)
+    assert isinstance(caught.value.cause, ZeroDivisionError)
+
+
+def test_a_brain_that_stays_put_runs_out_of_time_and_one_that_boasts_is_not_believed() -> None:
+    class Lazy(MissionNode):
+        def _decide(self) -> None:
+            pass
+
+    class Boaster(MissionNode):
+        def _decide(self) -> None:
+            self._finish()
+
+    assert "did not arrive" in drive(5, parts={"mission": Lazy}, time_limit=2.0).reason
+    run = drive(5, parts={"mission": Boaster}, time_limit=5.0)
+    assert not run.success and "from the goal" in run.reason
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"parts": {"pilot": PlannerNode}}, "pilot"),
+        ({"parts": {"planner": 3}}, "class that makes a node"),
+        ({"robot": "real"}, "surrogate"),
+        ({"profile": "orin"}, "Jetson profile"),
+        ({"model": "nowhere.onnx"}, "ONNX"),
+    ],
+)
+def test_bad_arguments_are_explained(arguments: dict[str, Any], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        drive(1, time_limit=0.5, **arguments)
+
+
+def test_a_replay_can_be_made_of_any_run() -> None:
+    run = drive(5, time_limit=3.0)
+    page = run.replay().static_html()
+    assert page.startswith("<!") and len(page) > 500_000
+
+
+def test_thinning_keeps_every_occupied_square_once() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-2, 2, (5000, 2))
+    thin = thin_out(points, 0.1)
+    squares = {(int(a), int(b)) for a, b in np.floor(points / 0.1)}
+    assert len(thin) == len(squares)
+    assert np.abs(points[:, None] - thin[None]).max(axis=2).min(axis=1).max() <= 0.05 + 1e-9
