@@ -36,11 +36,12 @@ CHROMIUM_ARGUMENTS = (
 
 @dataclass(frozen=True)
 class LabServer:
-    """A running ``robotbrain lab``: its address, the copied course, and what it said."""
+    """A running ``robotbrain lab``: its address, the copied course, the user's home and the process."""
 
     url: str
     course: Path
-    log: Path
+    home: Path
+    process: psutil.Popen
 
     def address(self, notebook: str = "", workspace: str = "") -> str:
         """The address of a notebook in a workspace of its own, or of the server's front page."""
@@ -48,7 +49,9 @@ class LabServer:
         return f"{self.url}{path}?token={TOKEN}"
 
 
-def wait_until(condition: Callable[[], T], timeout_s: float, what: Callable[[], str] | str, every_s: float = 0.2) -> T:
+def wait_until(
+    condition: Callable[[], T | None], timeout_s: float, what: Callable[[], str] | str, every_s: float = 0.2
+) -> T:
     """Return the first true value of ``condition()``, or fail saying ``what`` did not happen."""
     end = time.monotonic() + timeout_s
     while not (value := condition()):
@@ -98,7 +101,7 @@ def serve(course: Path, scratch: Path) -> Iterator[LabServer]:
 
     try:
         wait_until(up, 90, lambda: f"an answer from {url}\n{log.read_text(errors='replace')}")
-        yield LabServer(url, course, log)
+        yield LabServer(url, course, home, process)
     finally:
         end_tree(process)
 
@@ -119,7 +122,9 @@ def _home(scratch: Path) -> Path:
     home = scratch / "home"
     config = home / "jupyter" / "config"
     config.mkdir(parents=True)
-    (config / "jupyter_server_config.json").write_text(json.dumps({"ServerApp": {"allow_root": True}}))
+    # A user who lets the world in for other purposes has not asked for that here.
+    server = {"ServerApp": {"allow_root": True, "ip": "0.0.0.0", "root_dir": str(home)}}
+    (config / "jupyter_server_config.json").write_text(json.dumps(server))
     # Lets a test ask the page about notebook and kernel: cells out of view are not in its document.
     (config / "jupyter_lab_config.json").write_text(json.dumps({"LabApp": {"expose_app_in_browser": True}}))
     return home

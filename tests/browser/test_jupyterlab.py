@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import psutil
 import pytest
 
+from ..conftest import need
 from .page import NotebookPage, wait_for_3d_view
 from .server import CHROMIUM_ARGUMENTS, LabServer, copy_course, serve
 
@@ -30,8 +33,10 @@ def server(repo: Path, chromium: str, tmp_path_factory: pytest.TempPathFactory) 
 
 @pytest.fixture(scope="module")
 def browser(chromium: str) -> Iterator[Browser]:
-    sync_api = pytest.importorskip("playwright.sync_api")
-    with sync_api.sync_playwright() as playwright:
+    need(importlib.util.find_spec("playwright"), "no playwright (it is in the extra `dev`)")
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
         running = playwright.chromium.launch(executable_path=chromium, args=list(CHROMIUM_ARGUMENTS))
         yield running
         running.close()
@@ -82,3 +87,18 @@ def test_solved_lab_runs_to_the_end_and_shows_its_drives_in_3d(notebook: Noteboo
     for cell_id in ("meet-replay", "drive-mine"):
         wait_for_3d_view(notebook.show(cell_id))
         notebook.save_screenshot(f"solution_{cell_id}")
+
+
+def test_server_listens_on_loopback_only(server: LabServer) -> None:
+    family = [server.process, *server.process.children(recursive=True)]
+    listening = {c.laddr.ip for p in family for c in p.net_connections("tcp") if c.status == psutil.CONN_LISTEN}
+    assert listening == {"127.0.0.1"}
+
+
+def test_only_notebooks_and_their_checkpoints_are_written(server: LabServer, repo: Path) -> None:
+    """Everything above ran before this: nothing of it may litter the course or change the user's configuration."""
+    there = {p.relative_to(server.course) for p in server.course.rglob("*") if p.is_file()}
+    new = {p for p in there if not {".ipynb_checkpoints", "__pycache__"} & set(p.parts) and not (repo / p).is_file()}
+    assert not new
+    config = {p.name for p in (server.home / "jupyter" / "config").rglob("*") if p.is_file()}
+    assert config - {"migrated"} == {"jupyter_server_config.json", "jupyter_lab_config.json"}

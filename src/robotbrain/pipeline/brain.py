@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 import struct
 import time
 from collections.abc import Callable, Mapping
@@ -207,12 +208,12 @@ def drive(
     """
     from robotbrain.ros import SimContext
     from robotbrain.ros.record import DecisionLog
-    from robotbrain.sim import RobotSim, generate_world
+    from robotbrain.sim import RobotSim, World, generate_world
 
     if robot not in ("nominal", "surrogate"):
         raise InputError("robot", given=robot, expected="'nominal' or 'surrogate'", fix="Choose one of the two.")
     chosen = load_profile(profile) if isinstance(profile, str) else profile
-    world = generate_world(seed, difficulty) if isinstance(seed, int) else seed
+    world = seed if isinstance(seed, World) else generate_world(operator.index(seed), difficulty)
     noise_seed = world.spec.seed
     if robot == "surrogate":
         from robotbrain.sim.surrogate import surrogate_robot
@@ -274,7 +275,7 @@ def _run(context: Any, sim: RobotSim, watch: _Watch, time_limit: float) -> tuple
                 return "touched " + ", ".join(sorted(sim.truth.collided)), False
             if distance > GOAL_RADIUS:
                 return f"said it had arrived, {distance:.2f} m from the goal", False
-            if abs(sim.truth.twist.v) > 0.05:
+            if abs(sim.truth.twist.v) > 0.05 or abs(sim.truth.twist.w) > 0.2:
                 return "said it had arrived, but kept moving", False
             return "reached the goal", True
     return f"did not arrive within {time_limit:g} s", False
@@ -304,9 +305,7 @@ class _Watch:
             # CDR starts with four bytes of encapsulation, then the header's stamp.
             seconds, nanoseconds = struct.unpack_from("<iI", cdr, 4)
             self.perception_ms.append((time_ns - seconds * 1_000_000_000 - nanoseconds) * 1e-6)
-        elif topic == "/goal_reached":
-            self.reached = True
-        elif topic in ("/plan", "/goal_pose"):
+        elif topic in ("/plan", "/goal_pose", "/goal_reached"):
             from rclpy.serialization import deserialize_message
 
             from robotbrain.ros.conversions import msg_class
@@ -315,6 +314,8 @@ class _Watch:
             if topic == "/plan":
                 points = np.array([(p.pose.position.x, p.pose.position.y) for p in message.poses]).reshape(-1, 2)
                 self.plans.append((time_ns * 1e-9, points))
+            elif topic == "/goal_reached":
+                self.reached |= bool(message.data)
             else:
                 self.marker = (message.pose.position.x, message.pose.position.y)
 

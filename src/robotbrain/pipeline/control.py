@@ -105,8 +105,8 @@ def arc_clearance(speed: float, turn: float, points: NDArray[np.float64], horizo
         centres = np.stack([speed * t, np.zeros_like(t)], axis=1)
     else:
         centres = (speed / turn) * np.stack([np.sin(turn * t), 1.0 - np.cos(turn * t)], axis=1)
-    across, along = points[:, 0] - centres[:, :1], points[:, 1] - centres[:, 1:]
-    return float(np.sqrt((across**2 + along**2).min()))
+    ahead, aside = points[:, 0] - centres[:, :1], points[:, 1] - centres[:, 1:]
+    return float(np.sqrt((ahead**2 + aside**2).min()))
 
 
 class PathTracker:
@@ -147,7 +147,7 @@ class PathTracker:
             return self._back_up(near)
         position = np.asarray(pose[:2])
         remaining = float(np.linalg.norm(path[-1] - position))
-        if remaining < p.arrive or (final_yaw is not None and remaining < 3 * p.arrive):
+        if remaining < p.arrive:
             self._blocked_since = None
             return self._turn_to(pose, final_yaw)
         target = transform(inverse(pose), lookahead_point(path, position, p.lookahead))

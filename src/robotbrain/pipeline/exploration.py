@@ -68,6 +68,16 @@ class ViewMemory:
         # Where the robot stands there is nothing to look for; a target underfoot could never be faced.
         self._around(self.viewed, pose[0], pose[1], p.underfoot)
 
+    def moved_to(self, frame: GridFrame) -> ViewMemory:
+        """Return this memory on another grid, as when a mapper grows its map; new cells count as not viewed."""
+        moved = ViewMemory(frame, self.params)
+        moved.reach = self.reach
+        for old, new in ((self.viewed, moved.viewed), (self._rejected, moved._rejected)):
+            cells = frame.to_cells(self.frame.to_points(np.argwhere(old)))
+            cells = cells[frame.inside(cells)]
+            new[cells[:, 0], cells[:, 1]] = True
+        return moved
+
     def look_again(self) -> None:
         """Forget what was viewed and trust the camera less far: the marker was missed, so look again, from nearer."""
         self.viewed[:] = False
@@ -81,7 +91,8 @@ class ViewMemory:
     def _around(self, grid: NDArray[np.bool_], x: float, y: float, radius: float) -> None:
         reach = int(radius / self.frame.resolution)
         row, column = self.frame.to_cell(x, y)
-        grid[max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1] = True
+        rows = slice(max(row - reach, 0), max(row + reach + 1, 0))
+        grid[rows, max(column - reach, 0) : max(column + reach + 1, 0)] = True
 
     def next_target(self, pose: Pose, occupancy: NDArray[np.int8]) -> tuple[float, float] | None:
         """Return the most worthwhile reachable point that the camera has not viewed, x, y in m; None if all is viewed.
@@ -105,7 +116,7 @@ class ViewMemory:
         # The robot may stand within the clearance; it can still leave.
         reach = int(0.3 / self.frame.resolution)
         near = np.zeros_like(open_cells)
-        near[max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1] = True
+        near[max(row - reach, 0) : max(row + reach + 1, 0), max(column - reach, 0) : max(column + reach + 1, 0)] = True
         open_cells |= near & ~obstacle
         labels, _ = ndimage.label(open_cells)
         here = labels[min(max(row, 0), labels.shape[0] - 1), min(max(column, 0), labels.shape[1] - 1)]
@@ -125,8 +136,12 @@ class ViewMemory:
         offset = points - np.asarray(pose[:2])
         turn = np.abs(wrap_angle(np.arctan2(offset[:, 1], offset[:, 0]) - pose[2]))
         cost = np.hypot(offset[:, 0], offset[:, 1]) + p.turn_cost * turn
-        best = points[int(np.argmin(cost))]
-        return float(best[0]), float(best[1])
+        block = blocks[int(np.argmin(cost))] * b
+        # The block's middle may have been viewed; its wanted cell nearest to the middle was not.
+        cells = np.argwhere(wanted[block[0] : block[0] + b, block[1] : block[1] + b])
+        nearest = cells[int(np.argmin(((cells - (b - 1) / 2) ** 2).sum(axis=1)))]
+        x, y = self.frame.to_points(block + nearest + np.array([top, left]))
+        return float(x), float(y)
 
 
 @dataclass(eq=False)

@@ -5,6 +5,7 @@ Cells are indexed ``(row, column)``; rows grow with y, columns with x, as in ``n
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,8 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from robotbrain.errors import InputError
 
-FREE, OCCUPIED, UNKNOWN = 0, 100, -1
-"""Values of an occupancy grid (``nav_msgs/OccupancyGrid``): percent, or -1 where nothing is known."""
+UNKNOWN = -1
+"""Value of an occupancy grid (``nav_msgs/OccupancyGrid``) where nothing is known; elsewhere it is percent."""
 
 OCCUPIED_FROM = 65
 """Occupancy in percent from which a cell counts as an obstacle (the default of Nav2's static layer)."""
@@ -59,9 +60,14 @@ class GridFrame:
 
     def to_cell(self, x: float, y: float) -> Cell:
         """Return the (row, column) of one point in metres."""
+        # The same formula as to_cells: floor division rounds otherwise on the borders between cells.
+        if not (math.isfinite(x) and math.isfinite(y)):
+            raise InputError(
+                "point", given=(x, y), expected="finite x, y in metres", fix="Check the pose or goal it came from."
+            )
         return (
-            int((y - self.origin[1]) // self.resolution),
-            int((x - self.origin[0]) // self.resolution),
+            math.floor((y - self.origin[1]) / self.resolution),
+            math.floor((x - self.origin[0]) / self.resolution),
         )
 
     def to_points(self, cells: ArrayLike) -> NDArray[np.float64]:

@@ -66,6 +66,8 @@ class OccupancyMapper:
             angles: (N,) rad, counter-clockwise from the lidar's x axis.
         """
         step = 0.7 * self.frame.resolution
+        # REP 117: +inf is no return; -inf (too near to measure) says nothing about what is free.
+        ranges = np.where(np.isneginf(ranges), np.nan, ranges)
         silent = np.isinf(ranges)
         lost = silent & ~np.roll(silent, 1) & ~np.roll(silent, -1)
         ranges = np.where(lost, np.nan, ranges)

@@ -359,7 +359,9 @@ def plan_path(
         return PlanResult(None, found.expanded)
     inner = frame.to_points(smooth(found.path, cost))[1:-1]
     last = np.asarray(goal, dtype=float) if end == goal_cell else frame.to_points(end)
-    points = np.concatenate([[start], inner, [last]])
+    # A start in the lethal zone leaves it by the cell that the search began at, not across the zone.
+    first = [start] if begin == start_cell else [start, frame.to_points(begin)]
+    points = np.concatenate([first, inner, [last]])
     return PlanResult(resample(points, 2 * frame.resolution), found.expanded)
 
 

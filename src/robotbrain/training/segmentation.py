@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     import torch
     from torch import nn
 
-HELD_OUT_SEED = 1_000_000
-"""World seeds from here on are never trained on."""
+TRAINING_SEED, HELD_OUT_SEED = 500_000, 1_000_000
+"""First world of training and of the final figure; the worlds of lessons, labs and benchmarks lie below both."""
 
 
 @dataclass(frozen=True)
@@ -31,8 +31,8 @@ class TrainConfig:
     """The recipe.
 
     Attributes:
-        seed: of the weights, the data order and the worlds.
-        worlds: training worlds.
+        seed: of the weights and the data order.
+        worlds: training worlds, from TRAINING_SEED on.
         images_per_world: robot poses imaged in each.
         held_out_worlds: worlds kept for the final figure.
         epochs: passes over the data.
@@ -119,10 +119,13 @@ def train(config: TrainConfig, output: Path, *, progress: bool = True) -> dict[s
 
     if output.suffix != ".onnx":
         raise InputError("output", given=str(output), expected="a path ending in .onnx", fix="Add the suffix.")
+    if not 0 < config.worlds <= HELD_OUT_SEED - TRAINING_SEED:
+        limit = HELD_OUT_SEED - TRAINING_SEED
+        raise InputError("worlds", given=config.worlds, expected=f"1 to {limit}", fix="Keep training and test apart.")
     begin = time.perf_counter()
     torch.manual_seed(config.seed)
     rng = np.random.default_rng(config.seed)
-    images, labels, _ = render_dataset(range(config.seed, config.seed + config.worlds), config.images_per_world)
+    images, labels, _ = render_dataset(range(TRAINING_SEED, TRAINING_SEED + config.worlds), config.images_per_world)
     rendered = time.perf_counter() - begin
     inputs, targets = torch.from_numpy(normalise(images)), torch.from_numpy(labels.astype(np.int64))
     network = build_network(config.width).to(memory_format=torch.channels_last)  # type: ignore[call-overload]

@@ -12,9 +12,9 @@ from rclpy.node import Node
 from sensor_msgs.msg import LaserScan, PointCloud2
 
 from robotbrain.pipeline.control import ControlParams, PathTracker
-from robotbrain.pipeline.geometry import Pose, PoseBuffer, inverse, transform
-from robotbrain.pipeline.nodes.mapper import Waiting
+from robotbrain.pipeline.geometry import Pose, inverse, transform
 from robotbrain.pipeline.nodes.perception import FLOOR_LABEL
+from robotbrain.pipeline.nodes.poses import StampedPoses, check_finite
 from robotbrain.ros.conversions import cloud_to_points, path_to_numpy, quaternion_to_yaw, scan_to_arrays, time_to_ns
 
 RATE_HZ = 20.0
@@ -45,40 +45,36 @@ class ControllerNode(Node):
     def __init__(self, params: ControlParams | None = None) -> None:
         super().__init__("controller")
         self._tracker = PathTracker(params)
-        self._poses = PoseBuffer()
-        self._waiting = Waiting(self._poses)
+        self._poses = StampedPoses()
         self._path: NDArray[np.float64] = np.zeros((0, 2))
         self._final_yaw: float | None = None
         self._scan: _Sighting | None = None
         self._seen: list[_Sighting] = []
         self._publisher = self.create_publisher(Twist, "cmd_vel", 10)
-        self.create_subscription(Odometry, "odometry/filtered", self._on_odometry, 10)
+        self.create_subscription(Odometry, "odometry/filtered", self._poses.on_odometry, 10)
         self.create_subscription(LaserScan, "scan", self._on_scan, 2)
         self.create_subscription(PointCloud2, "perception/points", self._on_points, 2)
         self.create_subscription(Path, "plan", self._on_path, 1)
         self.create_timer(1.0 / RATE_HZ, self._control)
 
-    def _on_odometry(self, msg: Odometry) -> None:
-        position = msg.pose.pose.position
-        self._poses.add(
-            time_to_ns(msg.header.stamp), (position.x, position.y, quaternion_to_yaw(msg.pose.pose.orientation))
-        )
-        self._waiting.flush()
-
     def _on_path(self, msg: Path) -> None:
-        self._path = path_to_numpy(msg)
+        path = path_to_numpy(msg)
+        check_finite("plan", path)
+        self._path = path
+        # A path of one pose asks for its heading too; a longer one leaves the last heading open.
         self._final_yaw = quaternion_to_yaw(msg.poses[0].pose.orientation) if len(msg.poses) == 1 else None
 
     def _on_scan(self, msg: LaserScan) -> None:
         ranges, angles = scan_to_arrays(msg)
-        near = ranges < 2.0
+        # REP 117: -inf is too near to measure, +inf no return, NaN an error; none of them is a place.
+        near = np.isfinite(ranges) & (ranges < 2.0)
         local = ranges[near, None] * np.stack([np.cos(angles[near]), np.sin(angles[near])], axis=1)
         stamp = time_to_ns(msg.header.stamp)
 
         def keep(pose: Pose) -> None:
             self._scan = _Sighting(stamp, transform(pose, local))
 
-        self._waiting.add(stamp, keep)
+        self._poses.when_known(stamp, keep)
 
     def _on_points(self, msg: PointCloud2) -> None:
         points = cloud_to_points(msg).astype(np.float64)
@@ -86,7 +82,7 @@ class ControllerNode(Node):
         local = thin_out(local[np.hypot(local[:, 0], local[:, 1]) < 1.5])
         stamp = time_to_ns(msg.header.stamp)
         if len(local):
-            self._waiting.add(stamp, lambda pose: self._seen.append(_Sighting(stamp, transform(pose, local))))
+            self._poses.when_known(stamp, lambda pose: self._seen.append(_Sighting(stamp, transform(pose, local))))
 
     def _obstacles(self, pose: Pose, now: int) -> NDArray[np.float64]:
         self._seen = [s for s in self._seen if now - s.stamp_ns < POINTS_MAX_AGE * 1e9]

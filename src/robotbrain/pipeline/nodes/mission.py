@@ -13,11 +13,10 @@ from rclpy.task import Future
 from std_msgs.msg import Bool
 
 from robotbrain.pipeline.exploration import MarkerTracker, ViewMemory
-from robotbrain.pipeline.geometry import Pose, PoseBuffer, transform
-from robotbrain.pipeline.grid import GridFrame
+from robotbrain.pipeline.geometry import Pose, transform
 from robotbrain.pipeline.nodes.grids import grid_from_msg
-from robotbrain.pipeline.nodes.mapper import Waiting
-from robotbrain.ros.conversions import numpy_to_path, quaternion_to_yaw, time_to_ns, yaw_to_quaternion
+from robotbrain.pipeline.nodes.poses import StampedPoses, check_finite
+from robotbrain.ros.conversions import numpy_to_path, time_to_ns, yaw_to_quaternion
 
 RATE_HZ = 4.0
 REPLAN_AFTER = 1.5
@@ -36,17 +35,15 @@ class MissionNode(Node):
     """Explores with the camera until the marker is confirmed, then drives to it.
 
     Subscribes ``perception/marker``, ``odometry/filtered``, ``map``; calls the service ``plan``; publishes ``plan``,
-    ``goal_pose`` and, once there, ``goal_reached``.
+    ``goal_pose`` (only for a confirmed marker) and, once there, ``goal_reached``.
     """
 
     def __init__(self) -> None:
         super().__init__("mission")
-        self._poses = PoseBuffer()
-        self._waiting = Waiting(self._poses)
+        self._poses = StampedPoses()
         self._marker = MarkerTracker()
         self._views: ViewMemory | None = None
         self._occupancy: NDArray[np.int8] | None = None
-        self._frame: GridFrame | None = None
         self._target: tuple[float, float] | None = None
         self._target_since = 0.0
         self._planned_for: tuple[float, float] | None = None
@@ -60,27 +57,23 @@ class MissionNode(Node):
         self._goal_pub = self.create_publisher(PoseStamped, "goal_pose", 10)
         self._reached_pub = self.create_publisher(Bool, "goal_reached", latched)
         self._client = self.create_client(GetPlan, "plan")
-        self.create_subscription(Odometry, "odometry/filtered", self._on_odometry, 10)
+        self.create_subscription(Odometry, "odometry/filtered", self._poses.on_odometry, 10)
         self.create_subscription(OccupancyGrid, "map", self._on_map, latched)
         self.create_subscription(PointStamped, "perception/marker", self._on_marker, 10)
         self.create_timer(1.0 / RATE_HZ, self._decide)
 
-    def _on_odometry(self, msg: Odometry) -> None:
-        position = msg.pose.pose.position
-        self._poses.add(
-            time_to_ns(msg.header.stamp), (position.x, position.y, quaternion_to_yaw(msg.pose.pose.orientation))
-        )
-        self._waiting.flush()
-
     def _on_map(self, msg: OccupancyGrid) -> None:
-        self._occupancy, self._frame = grid_from_msg(msg)
+        self._occupancy, frame = grid_from_msg(msg)
         if self._views is None:
-            self._views = ViewMemory(self._frame)
+            self._views = ViewMemory(frame)
+        elif self._views.frame != frame:
+            self._views = self._views.moved_to(frame)
 
     def _on_marker(self, msg: PointStamped) -> None:
         seen = np.array([msg.point.x, msg.point.y])
+        check_finite("perception/marker", seen)
         # Where the robot was when the image was taken, not where it is now that the network has answered.
-        self._waiting.add(
+        self._poses.when_known(
             time_to_ns(msg.header.stamp),
             lambda pose: self._marker.add(transform(pose, seen), float(np.hypot(*seen))),
         )
@@ -93,6 +86,7 @@ class MissionNode(Node):
         self._views.look(pose, self._occupancy)
         goal = self._marker.estimate()
         if goal is not None:
+            self._target = None
             distance = float(np.hypot(goal[0] - pose[0], goal[1] - pose[1]))
             if distance < ARRIVED:
                 self._finish()
@@ -102,6 +96,7 @@ class MissionNode(Node):
             if now - self._near_since > NEAR_PATIENCE:
                 self._give_up_marker()
                 return
+            self._goal_pub.publish(self._pose_stamped(goal, 0.0))
             self._request(pose, goal, now)
             return
         self._explore(pose, now)
@@ -128,6 +123,7 @@ class MissionNode(Node):
 
     def _look_around(self, pose: Pose) -> None:
         """Turn on the spot while there is no better place to look."""
+        # A path of one pose asks the controller for that heading; it is here, so nothing is left to drive.
         path = numpy_to_path(np.array([pose[:2]]), stamp=self.get_clock().now().to_msg())
         path.poses[0].pose.orientation = yaw_to_quaternion(pose[2] + 2.0)
         self._planned_for = None
@@ -144,29 +140,31 @@ class MissionNode(Node):
         request.goal = self._pose_stamped(goal, 0.0)
         request.tolerance = 0.4
         self._planned_for, self._planned_at = goal, now
-        self._goal_pub.publish(request.goal)
+        target = self._target
         self._pending = self._client.call_async(request)
-        self._pending.add_done_callback(self._on_plan)
+        self._pending.add_done_callback(lambda future: self._on_plan(future, target))
 
-    def _on_plan(self, future: Future) -> None:
+    def _on_plan(self, future: Future, target: tuple[float, float] | None) -> None:
+        """Take the answer to a request made for ``target`` (None: for the marker)."""
         self._pending = None
         if self._done:
             return
         path = future.result().plan
+        if target != self._target:
+            # The slow planner's answer to a question that is no longer asked.
+            self._planned_for = None
+            return
         if len(path.poses):
             self._refusals = 0
-        if len(path.poses) == 0:
-            self._on_no_route()
-        self._plan_pub.publish(path)
-
-    def _on_no_route(self) -> None:
-        if self._marker.estimate() is not None:
+        elif target is None:
             self._refusals += 1
             if self._refusals >= PATIENCE:
                 self._give_up_marker()
-        elif self._target is not None and self._views is not None:
-            self._views.reject(*self._target)
+        else:
+            assert self._views is not None
+            self._views.reject(*target)
             self._target = None
+        self._plan_pub.publish(path)
 
     def _give_up_marker(self) -> None:
         self._marker.discard()
