@@ -124,6 +124,23 @@ MUTANTS = [
         replace={"astar": [("(cost[cell] + cost[other]) / 2", "1.0")]},
     ),
     Mutant(
+        name="stops-when-first-seen",
+        exercise="astar",
+        hint="expand-by-f",
+        describe="returns as soon as the goal is seen, not when it is taken off the queue",
+        replace={
+            "astar": [
+                (
+                    "                best[other], parent[other] = total, cell\n",
+                    "                best[other], parent[other] = total, cell\n"
+                    "                if other == goal:\n"
+                    "                    queue, closed, best[goal] = [(-1.0, goal)], set(), total\n"
+                    "                    continue\n",
+                )
+            ]
+        },
+    ),
+    Mutant(
         name="never-gives-up",
         exercise="astar",
         hint="no-route",
@@ -197,6 +214,24 @@ MUTANTS = [
                     "            response.plan = numpy_to_path(points)\n        return response",
                     "            response.plan = numpy_to_path(points)",
                 )
+            ]
+        },
+    ),
+    Mutant(
+        name="tolerance-ignored",
+        exercise="planner_node",
+        hint="off-the-map",
+        describe="ends anywhere near a blocked goal, however far",
+        replace={"planner_node": [("int(request.tolerance / frame.resolution)", "200")]},
+    ),
+    Mutant(
+        name="point-robot",
+        exercise="planner_node",
+        hint="robot-has-a-radius",
+        describe="plans for a robot without a radius",
+        replace={
+            "planner_node": [
+                ("inflate(occupancy, frame.resolution)", "inflate(occupancy, frame.resolution, radius=0.0)")
             ]
         },
     ),

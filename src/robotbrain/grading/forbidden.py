@@ -43,7 +43,10 @@ def why_forbidden(
         for code in _codes(function.__code__):
             imported = next((n for n in (*code.co_names, *_strings(code)) if _module_banned(n, ban)), None)
             if imported:
-                return f"`{name}` imports `{imported}`, which holds the course's own solution; write your own"
+                return (
+                    f"`{name}` imports `{imported}`, which holds the course's own solution; write your own"
+                    " (import the helpers that the notebook names at the top of the cell)"
+                )
             for used in code.co_names:
                 if used in others:
                     continue

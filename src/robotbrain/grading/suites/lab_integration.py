@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -44,8 +43,11 @@ HELPERS = (
     "interpolate",
     "nearest_free",
     "path_cost",
+    "resample",
     "segment_cost",
+    "transform",
     "wrap",
+    "wrap_angle",
 )
 for _exercise in suite.exercises:
     suite.forbid(_exercise, imports=("robotbrain.pipeline", "robotbrain.grading"), allow=HELPERS)
@@ -68,18 +70,23 @@ _HINTS = {
     "both-costs": "One image costs CPU time (callback_ms) AND inference (segmentation_ms): subtract both.",
     "cells-or-metres": "`distance_transform_edt` counts cells unless you pass `sampling=resolution`; radius and decay are metres.",
     "unknown-costs-more": "-1 means that nobody has looked there: no obstacle, but 2 dearer than seen floor.",
+    "empty-map": "With no obstacle in the map there is nothing to measure a distance to: handle that case before calling "
+    "`distance_transform_edt`, and let the costs be floats.",
     "lethal-radius": "Within the radius (d <= radius) the robot's centre must never be: the cost is inf there.",
     "threshold-65": "From 65 percent on a cell is an obstacle; 64 is not.",
     "decay-from-radius": "The extra cost is `weight` right at the radius and falls from there: the exponent is "
     "-(d - radius) / decay.",
     "diagonal-cost": "A diagonal step is sqrt(2) long. With a length of 1, zigzag looks as short as straight.",
-    "admissible-heuristic": "Manhattan distance overestimates where diagonal steps are allowed, so A* may settle for a "
-    "dearer path. Use the octile distance.",
+    "admissible-heuristic": "A path that is too dear has one of three causes: h overestimates somewhere (Manhattan distance "
+    "does where diagonal steps are allowed), a step does not cost length times mean, or the search stops too early.",
     "corner-cutting": "A diagonal step between two cells is only allowed if both cells beside it are finite.",
     "use-the-costs": "A step costs its length times the MEAN of the two cells' costs. Counting steps alone ignores the costmap.",
     "expand-by-f": "Order the queue by f = g + h, and stop when the goal is taken OFF the queue, not when it is first seen.",
     "no-route": "When the queue runs empty without reaching the goal there is no route: return None.",
-    "path-ends": "The path holds both ends: it starts with `start` and ends with `goal`.",
+    "path-ends": "The path holds both ends, as (row, column): it starts with `start` and ends with `goal`.",
+    "leave-inputs-alone": "The array you are given belongs to the caller: work on a copy.",
+    "next-cell-always": "The next cell of the path is always allowed, even if no longer segment is; else the loop never ends.",
+    "use-slack": "How much dearer a segment may be is the argument `slack`.",
     "lethal-shortcut": "A segment may be used only if segment_cost is finite: check the cells in between, not only its ends.",
     "keep-the-distance": "Compare the segment's cost with `slack` times the cost of the stretch it replaces; a shortcut "
     "that is merely free of collisions hugs the corner.",
@@ -87,12 +94,17 @@ _HINTS = {
     "pose-at-stamp": "The sighting belongs to the moment its image was taken. Ask the buffer for the pose AT that stamp, "
     "not for the newest one.",
     "rotate-then-add": "The sighting is given in the robot's frame: rotate it by the yaw, then add the robot's position.",
+    "yaw-wraps": "Yaw jumps from pi to -pi. Between two poses turn the short way round (PoseBuffer does).",
     "three-sightings": "Fewer than three sightings are no goal yet: return None.",
     "drop-unknown-pose": "If the buffer has no pose for the stamp, `at` returns None: drop that sighting.",
     "row-is-y": "Cells are (row, column), rows are y. Let frame.to_cell and frame.to_points do the swapping.",
     "return-response": "A service callback must return the response, also when it is empty.",
     "empty-when-stuck": "Without a map or a route the response's path stays empty, and the callback still returns.",
-    "off-the-map": "Start or goal may lie in a blocked cell: use nearest_free before searching.",
+    "off-the-map": "Start or goal may lie in a blocked cell. nearest_free finds a free one within a number of CELLS (for the "
+    "goal: the tolerance), or returns None: then there is no route.",
+    "robot-has-a-radius": "The path must keep the robot's radius from every obstacle: inflate with the map's own resolution "
+    "(frame.resolution), in metres.",
+    "percent-or-share": "A rate is a share between 0 and 1.",
     "wilson-not-wald": "p ± z·sqrt(p(1-p)/n) collapses to a point at 0 and 1. Wilson's interval does not.",
     "once-per-seed": "Call drive exactly once for each seed: runs are dear, and a second call would be another sample.",
     "pool-latencies": "Take the percentile of all latencies of all runs together, not the mean of each run's percentile.",
@@ -164,17 +176,25 @@ def deadline_simple(student: Any) -> None:
 # ---------------------------------------------------------------- Part 2
 
 
-@suite.test("inflate", points=3, name="one obstacle in an open field", reread="Exercise 2.1")
+@suite.test("inflate", points=2, name="one obstacle in an open field", reread="Exercise 2.1")
 def inflate_point(student: Any) -> None:
     occupancy = np.zeros((15, 17), dtype=np.int8)
     occupancy[7, 8] = 100
     tools.compare_inflation(student.inflate, occupancy, 0.1, radius=0.25, decay=0.2, weight=8.0)
 
 
-@suite.test("inflate", points=1, name="unknown cells cost 2 more", hint="unknown-costs-more", reread="Exercise 2.1")
+@suite.test("inflate", points=1, name="a map without obstacles", hint="empty-map", reread="Exercise 2.1")
+def inflate_empty(student: Any) -> None:
+    occupancy = np.zeros((3, 4), dtype=np.int8)
+    expect_close(student.inflate(occupancy, 0.05), np.ones((3, 4)), given="3 x 4 free cells, int8, no obstacle")
+
+
+@suite.test("inflate", points=1, name="unknown cells cost 2 more", reread="Exercise 2.1")
 def inflate_unknown(student: Any) -> None:
-    occupancy = np.array([[0, -1, 0]], dtype=np.int8)
-    expect_close(student.inflate(occupancy, 0.05), [[1.0, 3.0, 1.0]], given="occupancy [[0, -1, 0]], no obstacle")
+    occupancy = np.zeros((9, 9), dtype=np.int8)
+    occupancy[0, 0] = 100
+    occupancy[4:, 4:] = -1
+    tools.compare_inflation(student.inflate, occupancy, 0.1, radius=0.15, decay=0.1, weight=5.0)
 
 
 @suite.test("astar", points=2, name="straight across an empty field", reread="Exercise 2.2")
@@ -202,6 +222,8 @@ def astar_weights(student: Any) -> None:
 def astar_no_route(student: Any) -> None:
     cost = np.ones((5, 5))
     cost[:, 2] = np.inf
+    # An answer that is None for every map has not understood the question.
+    tools.compare_astar(student.astar, np.ones((3, 3)), (0, 0), (2, 2))
     answer = student.astar(cost, (2, 0), (2, 4))
     expect(answer is None, "there is no route through a closed wall", got=answer, expected="None")
 
@@ -213,7 +235,16 @@ def smooth_open(student: Any) -> None:
     expect(kept == [(0, 0), (4, 7)], got=kept, expected=[(0, 0), (4, 7)], given=path)
 
 
-@suite.test("smooth", points=2, name="never through a wall", hint="lethal-shortcut", reread="Exercise 2.3")
+@suite.test("smooth", points=1, name="the next cell is always allowed", hint="next-cell-always", time_limit_s=2.0)
+def smooth_next(student: Any) -> None:
+    cost = np.ones((3, 3))
+    cost[0, 1] = cost[1, 0] = cost[1, 2] = cost[2, 1] = 40.0
+    path = [(0, 0), (1, 1), (2, 2)]
+    kept = tools.smoothed(student.smooth, path, cost)
+    expect(kept == path, got=kept, expected=path, given="dear cells on both sides of a diagonal path")
+
+
+@suite.test("smooth", points=1, name="never through a wall", hint="lethal-shortcut", reread="Exercise 2.3")
 def smooth_wall(student: Any) -> None:
     cost = np.ones((8, 9))
     cost[0:6, 4] = np.inf
@@ -266,9 +297,19 @@ def planner_without_map(student: Any) -> None:
 # ---------------------------------------------------------------- Parts 4 and 5
 
 
-@suite.test("evaluate", points=3, name="rate and interval of made-up runs", reread="Exercise 4")
+@suite.test("evaluate", points=1, name="the rate of made-up runs", reread="Exercise 4")
 def evaluate_rate(student: Any) -> None:
-    tools.compare_evaluation(student.evaluate, [True] * 7 + [False] * 3)
+    tools.compare_evaluation(student.evaluate, [True] * 7 + [False] * 3, ("success_rate",))
+
+
+@suite.test("evaluate", points=1, name="Wilson's interval of made-up runs", reread="Exercise 4")
+def evaluate_interval(student: Any) -> None:
+    tools.compare_evaluation(student.evaluate, [True] * 7 + [False] * 3, ("interval",))
+
+
+@suite.test("evaluate", points=1, name="the 95th percentile of made-up runs", reread="Exercise 4")
+def evaluate_percentile(student: Any) -> None:
+    tools.compare_evaluation(student.evaluate, [True] * 7 + [False] * 3, ("p95_ms",))
 
 
 @suite.test("evaluate", points=2, name="one drive per seed", hint="once-per-seed", reread="Exercise 4")
@@ -277,7 +318,7 @@ def evaluate_calls(student: Any) -> None:
 
     def drive(seed: int) -> Any:
         calls.append(seed)
-        return SimpleNamespace(success=True, perception_ms=np.array([5.0]))
+        return tools.made_up_run(True, np.array([5.0]))
 
     student.evaluate(drive, range(3, 9))
     expect(sorted(calls) == list(range(3, 9)), got=calls, expected=list(range(3, 9)), given="seeds 3 to 8")
