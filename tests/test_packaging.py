@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -82,3 +83,13 @@ def test_a_wheel_would_carry_weights_profiles_and_settings(repo: Path) -> None:
     assert included == {"autograder/profiles": "robotbrain/jetson/data"}
     for name in ("pipeline/weights/segmentation.onnx", "jupyter_config/nbgrader_config.json", "py.typed"):
         assert (repo / "src" / "robotbrain" / name).is_file()
+
+
+def test_nothing_reports_usage(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """ONNX Runtime writes an identity for its reports into the home folder unless it was told not to."""
+    code = "from robotbrain.jetson import OnnxEngine\nfrom robotbrain.pipeline.brain import default_model\n"
+    code += "OnnxEngine(default_model())"
+    environment = {k: v for k, v in os.environ.items() if k != "ORT_DISABLE_TELEMETRY"}
+    environment |= {"HOME": str(tmp_path), "USERPROFILE": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    subprocess.run([sys.executable, "-c", code], check=True, env=environment)
+    assert not [p for p in tmp_path.rglob("*") if "onnxruntime" in p.name.lower()]

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robotbrain.files import atomic_path, write_text
 
@@ -152,7 +153,7 @@ def _drive_table(runs: Sequence[RunResult]) -> str:
     rows = "".join(
         f"<tr><th scope=row>{run.seed}</th><td>{html.escape(run.reason)}</td><td>{run.seconds:.1f}</td>"
         f"<td>{run.path_length:.1f}</td><td>{run.goal_distance:.2f}</td><td>{np.median(run.perception_ms):.1f}</td>"
-        f"<td>{np.percentile(run.planning_ms, 95):.0f}</td><td>{run.real_time_factor:.1f}</td>"
+        f"<td>{_percentile(run.planning_ms)}</td><td>{run.real_time_factor:.1f}</td>"
         f"<td><code>{run.log_sha256[:12]}</code></td></tr>"
         for run in runs
     )
@@ -164,6 +165,11 @@ def _drive_table(runs: Sequence[RunResult]) -> str:
         f"<tbody>{rows}</tbody></table></div><p>Latencies are simulated, on {PROFILE}. The digest covers every message:"
         " the same seed gives the same digest on this machine.</p>"
     )
+
+
+def _percentile(values: NDArray[np.float64]) -> str:
+    """The 95th percentile, or a dash where a run ended before anything was measured."""
+    return f"{np.percentile(values, 95):.0f}" if len(values) else "-"
 
 
 def _class_table(result: ClassResult, manifest: dict[str, dict[str, Any]], out: Path) -> str:

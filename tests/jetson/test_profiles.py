@@ -29,6 +29,7 @@ def test_slower_modules_are_slower_in_everything() -> None:
     for fast, slow in itertools.pairwise(order):
         assert fast.segmentation_ms < slow.segmentation_ms
         assert all(fast.callback_ms[k] < slow.callback_ms[k] for k in fast.callback_ms)
+        assert fast.planning_ns(0) < slow.planning_ns(0) and fast.planning_ns(5000) < slow.planning_ns(5000)
 
 
 def test_an_unknown_profile_suggests_the_nearest() -> None:
@@ -60,6 +61,9 @@ per_1000_cells_ms = 3
 """
 
 
+SEGMENTATION = GOOD[GOOD.index("[segmentation]") : GOOD.index("[callbacks]")].strip()
+
+
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
@@ -70,6 +74,11 @@ per_1000_cells_ms = 3
         ('"measured"', '"heard"', "provenance"),
         ('"my desk"', '""', "source"),
         ('slug = "mine"', 'slug = "yours"', "slug"),
+        (
+            '[segmentation]\nvalue_ms = 1.0\nprovenance = "measured"\nsource = "my desk"',
+            "segmentation = 3",
+            "segmentation",
+        ),
         ("[planner]", "[planner", "TOML"),
     ],
 )
@@ -92,8 +101,20 @@ def test_no_profiles_at_all_is_explained(tmp_path: Path, monkeypatch: pytest.Mon
         list_profiles()
 
 
-def test_the_engine_agrees_with_the_network_in_torch() -> None:
-    """The exported file and the same weights read back into torch give the same logits."""
+def test_weights_beside_the_model_are_found(tmp_path: Path) -> None:
+    import onnx
+
+    model = onnx.load(default_model())
+    path = tmp_path / "outside.onnx"
+    onnx.save_model(model, path, save_as_external_data=True, location="outside.onnx.data", size_threshold=0)
+    x = np.ones((1, 3, 64, 64), np.float32)
+    np.testing.assert_array_equal(OnnxEngine(path).infer(x), OnnxEngine(default_model()).infer(x))
+    (tmp_path / "outside.onnx.data").unlink()
+    with pytest.raises(InputError, match="ONNX"):
+        OnnxEngine(path)
+
+
+def test_the_engine_agrees_with_the_onnx_reference_evaluator() -> None:
     import onnx
     from onnx.reference import ReferenceEvaluator
 

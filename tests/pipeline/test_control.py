@@ -87,8 +87,9 @@ def test_backs_up_only_after_its_patience() -> None:
     assert tracker.command(1.0, (0, 0, 0), path, None, wall).speed == 0.0
     backing = tracker.command(2.0, (0, 0, 0), path, None, wall)
     assert backing.status == "backing" and backing.speed < 0
-    behind = np.concatenate([wall, -wall])
-    assert PathTracker().command(0.0, (0, 0, 0), path, None, behind).speed == 0.0
+    cornered, between = PathTracker(), np.concatenate([wall, -wall])
+    for time in (0.0, 1.0, 2.0, 3.0):
+        assert cornered.command(time, (0, 0, 0), path, None, between).speed == 0.0
 
 
 def test_without_a_path_it_stays() -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_dilation
 
+from robotbrain.errors import InputError
 from robotbrain.pipeline.exploration import MarkerTracker, ViewMemory
 from robotbrain.pipeline.grid import GridFrame
 from robotbrain.pipeline.mapping import OccupancyMapper
@@ -53,6 +54,12 @@ def test_no_return_clears_but_marks_nothing_and_nan_is_ignored() -> None:
     assert at(grid, 3.0, 0.01) < 50 and at(grid, 3.0, 0.01) >= 0
     assert (grid >= 65).sum() == 0
     assert at(grid, 0.01, 2.0) == -1
+
+
+def test_a_beam_too_near_to_measure_clears_nothing() -> None:
+    mapper = OccupancyMapper(FRAME)
+    mapper.add_scan((0, 0, 0), np.full(360, -np.inf), ANGLES)
+    assert (mapper.occupancy() == -1).all()
 
 
 def test_a_lone_silent_beam_between_returns_is_a_lost_echo() -> None:
@@ -134,6 +141,45 @@ def test_looking_again_goes_nearer() -> None:
     memory.look((-3.0, 0.0, 0.0), occupancy)
     assert memory.viewed[FRAME.to_cell(-1.0, 0.0)]
     assert not memory.viewed[FRAME.to_cell(1.0, 0.0)]
+
+
+def test_a_target_is_reachable_and_was_never_viewed() -> None:
+    rng = np.random.default_rng(4)
+    for _ in range(40):
+        occupancy = np.zeros(FRAME.shape, dtype=np.int8)
+        memory = ViewMemory(FRAME)
+        for _ in range(rng.integers(1, 6)):
+            pose = (rng.uniform(-3, 3), rng.uniform(-3, 3), rng.uniform(-3, 3))
+            memory.look(pose, occupancy)
+        target = memory.next_target(pose, occupancy)
+        if target is not None:
+            assert not memory.viewed[FRAME.to_cell(*target)]
+
+
+def test_a_robot_off_the_map_marks_nothing() -> None:
+    memory = ViewMemory(FRAME)
+    memory.look((-12.0, -12.0, np.pi), np.zeros(FRAME.shape, dtype=np.int8))
+    assert not memory.viewed.any()
+
+
+def test_memory_moves_with_a_map_that_grows() -> None:
+    memory = ViewMemory(FRAME)
+    memory.look((0.0, 0.0, 0.0), np.zeros(FRAME.shape, dtype=np.int8))
+    memory.reject(-2.0, -2.0)
+    larger = GridFrame.centred(6.0, 0.05)
+    moved = memory.moved_to(larger)
+    assert moved.viewed.sum() == memory.viewed.sum()
+    assert moved.viewed[larger.to_cell(2.0, 0.0)] and not moved.viewed[larger.to_cell(-2.0, 0.0)]
+
+
+def test_one_point_and_many_points_fall_into_the_same_cells() -> None:
+    borders = 0.05 * np.arange(-79, 80)
+    many = FRAME.to_cells(np.stack([borders, borders[::-1]], axis=1))
+    assert [FRAME.to_cell(float(x), float(y)) for x, y in zip(borders, borders[::-1], strict=True)] == [
+        tuple(cell) for cell in many.tolist()
+    ]
+    with pytest.raises(InputError, match="finite"):
+        FRAME.to_cell(float("nan"), 0.0)
 
 
 def test_a_rejected_target_is_not_proposed_again() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import re
 import textwrap
 from dataclasses import dataclass
 from typing import Any
@@ -72,9 +73,9 @@ class Report:
         return notes
 
     def __repr__(self) -> str:
-        lines = [f"{self.title}: {self.earned:g} of {self.points:g} points"]
+        lines = [f"{self.title}: {_points(self.earned)} of {self.points:g} points"]
         for result in self.results:
-            head = f"{result.verdict.symbol} {result.name} ({result.earned:g}/{result.points:g})"
+            head = f"{result.verdict.symbol} {result.name} ({_points(result.earned)}/{result.points:g})"
             lines.append(f"  {head}: {result.verdict.label}")
             for label, text in _details(result):
                 first, *rest = [
@@ -86,7 +87,7 @@ class Report:
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
-        share = "all tests passed" if self.full else f"{self.earned:g} of {self.points:g} points"
+        share = "all tests passed" if self.full else f"{_points(self.earned)} of {self.points:g} points"
         rows = "".join(_row(result) for result in self.results)
         notes = "".join(f'<p style="margin:6px 0 0">{html.escape(note)}</p>' for note in self._notes())
         head = "".join(
@@ -95,9 +96,9 @@ class Report:
         return (
             '<div class="robotbrain-report" role="group" style="background:#fff;color:#1a1a1a;'
             'border:1px solid #8a8a8a;border-radius:4px;padding:8px 12px;max-width:60em">'
-            '<table style="border-collapse:collapse;width:100%;background:#fff;color:#1a1a1a">'
+            '<table style="border-collapse:collapse;table-layout:auto;width:100%;background:#fff;color:#1a1a1a">'
             '<caption style="text-align:left;font-weight:bold;padding:4px 8px;caption-side:top;color:#1a1a1a">'
-            f"{html.escape(self.title)}: {html.escape(share)}</caption>"
+            f"{html.escape(self.title)} ({html.escape(share)})</caption>"
             f"<thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>{notes}</div>"
         )
 
@@ -119,18 +120,31 @@ def _details(result: TestResult) -> list[tuple[str, str]]:
 def _row(result: TestResult) -> str:
     colour = _COLOURS.get(result.verdict, _FAILED_COLOUR)
     details = "".join(
-        f'<div style="margin:2px 0 2px 1.2em">{f"<b>{label}:</b> " if label else ""}'
-        f'<span style="white-space:pre-wrap">{html.escape(text)}</span></div>'
+        f'<div style="margin:2px 0 2px 1.2em">{f"<b>{label}:</b> " if label else ""}{_text_html(label, text)}</div>'
         for label, text in _details(result)
     )
     cell = "padding:4px 8px;vertical-align:top;text-align:left;border-top:1px solid #d0d0d0"
     hidden = " <i>(hidden)</i>" if result.hidden else ""
     return (
-        f'<tr><td style="{cell}">{html.escape(result.name)}{hidden}{details}</td>'
+        f'<tr><td style="{cell}">{html.escape(result.name)}{hidden}</td>'
         f'<td style="{cell};white-space:nowrap;color:{colour};font-weight:bold">'
         f"{result.verdict.symbol} {result.verdict.label}</td>"
-        f'<td style="{cell};white-space:nowrap">{result.earned:g} / {result.points:g}</td></tr>'
+        f'<td style="{cell};white-space:nowrap">{_points(result.earned)} / {result.points:g}</td></tr>'
+        + (f'<tr><td colspan="3" style="padding:0 8px 6px;text-align:left">{details}</td></tr>' if details else "")
     )
+
+
+def _points(earned: float) -> str:
+    """Points with at most one decimal: nobody reads the rest."""
+    return f"{earned:.1f}".removesuffix(".0")
+
+
+def _text_html(label: str, text: str) -> str:
+    """Values as they would be printed; sentences with their `code` marked as such."""
+    if label in ("given", "expected", "got", "printed"):
+        return f'<code style="white-space:pre-wrap">{html.escape(text)}</code>'
+    marked = re.sub(r"`([^`]+)`", r"<code>\1</code>", html.escape(text))
+    return f'<span style="white-space:pre-wrap">{marked}</span>'
 
 
 class Score(float):

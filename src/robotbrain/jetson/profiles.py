@@ -102,8 +102,16 @@ def load_profile(slug: str) -> JetsonProfile:
 
 
 def _parse(path: Path, data: dict[str, Any]) -> JetsonProfile:
+    def group_of(table: str) -> dict[str, Any]:
+        found = data.get(table, {})
+        if not isinstance(found, dict):
+            raise InputError(
+                f"{path.name}: {table}", given=found, expected="a table", fix=f"Begin it with a line [{table}]."
+            )
+        return found
+
     def number(table: str, key: str) -> float:
-        value = data.get(table, {}).get(key)
+        value = group_of(table).get(key)
         if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < 1e5:
             raise InputError(
                 f"{path.name}: [{table}] {key}",
@@ -114,7 +122,7 @@ def _parse(path: Path, data: dict[str, Any]) -> JetsonProfile:
         return float(value)
 
     def text(key: str, table: str | None = None) -> str:
-        value = (data if table is None else data.get(table, {})).get(key)
+        value = (data if table is None else group_of(table)).get(key)
         if not isinstance(value, str) or not value:
             where = f"{path.name}: {key}" if table is None else f"{path.name}: [{table}] {key}"
             raise InputError(where, given=value, expected="text", fix="Compare with the other profiles.")

@@ -109,28 +109,37 @@ class RunResult:
 class ProfileCosts:
     """Simulated CPU time of the brain's callbacks on a Jetson profile (a cost model for ``robotbrain.ros``).
 
-    The inference itself and the planner's search charge their own time; what is here is the rest.
+    Costs go by a node's role, whatever it is called: by topic for subscriptions, one price for a role's timers and
+    one for the plan service. The inference itself and the reference planner's search charge their own time on top.
     """
 
-    _BY_CALLBACK: Mapping[tuple[str, str], str] = {
-        ("/perception", "/camera/image"): "perception",
-        ("/estimator", "/scan"): "estimator_scan",
-        ("/estimator", "/joint_states"): "estimator_wheels",
-        ("/mapper", "/scan"): "mapper",
-        ("/mapper", "/perception/points"): "mapper",
-        ("/mission", "_decide"): "mission",
-        ("/controller", "_control"): "controller",
+    _TOPICS: Mapping[tuple[str, str], str] = {
+        ("perception", "/camera/image"): "perception",
+        ("estimator", "/scan"): "estimator_scan",
+        ("estimator", "/joint_states"): "estimator_wheels",
+        ("mapper", "/scan"): "mapper",
+        ("mapper", "/perception/points"): "mapper",
     }
+    _TIMERS = ("mission", "controller")
 
     def __init__(self, profile: JetsonProfile) -> None:
-        self._costs = {key: profile.callback_ns(name) for key, name in self._BY_CALLBACK.items()}
+        self._topics = {key: profile.callback_ns(name) for key, name in self._TOPICS.items()}
+        self._timers = {role: profile.callback_ns(role) for role in self._TIMERS}
         self._plan = profile.planning_ns(0)
+        self._roles: dict[str, str] = {}
+
+    def assign(self, node_name: str, role: str) -> None:
+        """Say which role the node of this fully qualified name plays."""
+        self._roles[node_name] = role
 
     def cost(self, node_name: str, kind: str, name: str) -> int:
         """Return the cost of one callback in ns; 0 for callbacks that only store a message."""
-        if kind == "service" and name == "/plan":
-            return self._plan
-        return self._costs.get((node_name, name), 0)
+        role = self._roles.get(node_name, "")
+        if kind == "service":
+            return self._plan if role == "planner" else 0
+        if kind == "timer":
+            return self._timers.get(role, 0)
+        return self._topics.get((role, name), 0)
 
 
 def make_parts(
@@ -222,19 +231,25 @@ def drive(
         sim = RobotSim(world, body, sensors, seed=noise_seed)
     else:
         sim = RobotSim(world, seed=noise_seed)
-    context = SimContext(cost_model=ProfileCosts(chosen))
+    costs = ProfileCosts(chosen)
+    context = SimContext(cost_model=costs)
     log = DecisionLog(context)
     watch = _Watch(context)
     with context.as_default():
         from robotbrain.pipeline.nodes.robot import RobotNode
 
         RobotNode(sim)
-        for make in make_parts(chosen, sim, model, parts).values():
+        for role, make in make_parts(chosen, sim, model, parts).items():
+            before = set(context.nodes)
             make()
+            for node in set(context.nodes) - before:
+                costs.assign(node.get_fully_qualified_name(), role)
         began = time.perf_counter()
-        reason, success = _run(context, sim, watch, time_limit)
+        try:
+            reason, success = _run(context, sim, watch, time_limit)
+        finally:
+            context.try_shutdown()
         wall_seconds = time.perf_counter() - began
-    context.try_shutdown()
     return RunResult(
         seed=world.spec.seed,
         robot=robot,
