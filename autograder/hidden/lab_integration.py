@@ -167,15 +167,18 @@ def planner_edges(student):
     closed[:, 39:41] = 100
     points = tools.ask_for_plan(student.MyPlanner, (closed, room[1], room[2]), (-1.5, 0.4), (1.5, 0.4))
     expect(len(points) == 0, "a path through a closed wall", hint="empty-when-stuck")
-    # Other cells, and a gap that the robot does not fit through beside one that it does.
+    # Cells of another size; first with a gap that the robot fits through, then with one that it does not (0.3 m).
     coarse = np.zeros((30, 40), dtype=np.int8)
     coarse[[0, -1], :] = coarse[:, [0, -1]] = 100
     coarse[:, 20] = 100
-    coarse[14:17, 20] = 0
     coarse[3:11, 20] = 0
-    gaps = (coarse, 0.1, (-2.0, -1.5))
-    path = tools.compare_plan(student.MyPlanner, gaps, (-1.5, 0.0), (1.5, 0.0))
-    expect(tools.clearance(path, gaps) > 0.2, "the path scrapes along an obstacle", hint="robot-has-a-radius")
+    gap = (coarse, 0.1, (-2.0, -1.5))
+    path = tools.compare_plan(student.MyPlanner, gap, (-1.5, 0.0), (1.5, 0.0))
+    expect(tools.clearance(path, gap) > 0.25, "the path scrapes along an obstacle", hint="robot-has-a-radius")
+    coarse[:, 20] = 100
+    coarse[14:17, 20] = 0
+    points = tools.ask_for_plan(student.MyPlanner, (coarse, 0.1, (-2.0, -1.5)), (-1.5, 0.0), (1.5, 0.0))
+    expect(len(points) == 0, "a path through a gap too narrow for the robot", hint="robot-has-a-radius")
 
 
 @suite.test("planner_node", points=3, name="drives a robot to the marker", time_limit_s=120)

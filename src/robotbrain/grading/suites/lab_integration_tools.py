@@ -390,7 +390,7 @@ def ask_for_plan(
             context.run_for(5.0)
         except Exception as error:
             cause = error.__cause__ or error
-            forgot = "NoneType" not in str(cause) and "return" in str(cause).lower()
+            forgot = "must return" in str(cause)
             hint = "return-response" if forgot else "empty-when-stuck" if "NoneType" in str(cause) else ""
             if isinstance(cause, NotImplementedError):
                 raise cause from None
@@ -411,8 +411,9 @@ def compare_plan(
     given = f"start {start}, goal {goal} in a walled room"
     expect(len(points) > 1, "the path is empty, but there is a route", got=f"{len(points)} poses", given=given)
     occupancy, resolution, origin = room
-    swapped = points[:, ::-1]
-    hint = "row-is-y" if np.hypot(*(swapped[-1] - goal)) < 0.4 and np.hypot(*(points[-1] - goal)) > 0.4 else ""
+    mirrored = (points - np.asarray(origin))[:, ::-1] + np.asarray(origin)
+    lost = np.hypot(*(points[0] - start)) > 0.4 and np.hypot(*(mirrored[0] - start)) < 0.4
+    hint = "row-is-y" if lost else ""
     expect(np.hypot(*(points[0] - start)) < 0.6, "the path does not begin at the start", got=points[0], hint=hint)
     reach = tolerance + 1.5 * resolution
     expect(np.hypot(*(points[-1] - goal)) < reach, "the path does not end at the goal", got=points[-1], hint=hint)
