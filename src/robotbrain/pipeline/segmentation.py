@@ -142,11 +142,16 @@ def ground_points(
     """Return floor points and obstacle points (N, 2) in the base frame, m, within ``max_range``.
 
     Obstacle points above the robot (0.5 m) are left out, and so are those on the floor: a wrong pixel there, at the
-    edge of the mat, say, would wall off free ground. The marker's mat counts as floor.
+    edge of the mat, say, would wall off free ground. The marker's mat counts as floor. Depth has a say, too: no label
+    turns something that stands above the floor into free ground.
     """
     finite = np.isfinite(points[..., 0])
     near = finite & (np.hypot(points[..., 0], points[..., 1]) < max_range)
     low = near & (points[..., 2] < 0.5)
-    floor = low & ((mask == FLOOR) | (mask == MARKER)) & (points[..., 2] < 0.1)
-    obstacle = low & (mask == OBSTACLE) & (points[..., 2] > OBSTACLE_ABOVE)
+    height = points[..., 2]
+    floor = low & ((mask == FLOOR) | (mask == MARKER)) & (height < OBSTACLE_ABOVE)
+    # What clearly stands above the floor stops the robot, whatever the network takes it for. The margin grows with the
+    # distance, because the base pitches a little when it brakes.
+    standing = low & (height > 0.06 + 0.01 * np.hypot(points[..., 0], points[..., 1]))
+    obstacle = (low & (mask == OBSTACLE) & (height > OBSTACLE_ABOVE)) | standing
     return points[floor][:, :2], points[obstacle][:, :2]
