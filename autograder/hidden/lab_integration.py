@@ -11,6 +11,9 @@ from robotbrain.grading.suites import lab_integration_tools as tools
 
 suite = Suite.extending("lab_integration")
 
+DEPLOYED = "orin-nano-8gb:15W"
+"""Module and power mode of the reference profile on which a student's node must drive."""
+
 
 @suite.test("preprocess", points=2, name="random images of other sizes", reread="Exercise 1.1")
 def preprocess_random(student):
@@ -35,12 +38,18 @@ def back_project_oblong(student):
     tools.compare_points(student.back_project, depth, mounted_aside)
 
 
-@suite.test("deadline", points=2, name="other modules and rates", reread="Exercise 1.3")
+@suite.test("deadline", points=1, name="other modules and rates", reread="Exercise 1.3")
 def deadline_random(student):
     rng = student.rng("deadline")
     for rate_hz in (5.0, 12.5, 30.0, 24.0):
         module = tools.profile(float(rng.uniform(1, 80)), float(rng.uniform(1, 40)))
         tools.compare_deadline(student.deadline_slack_ms, module, rate_hz)
+
+
+@suite.test("deadline", points=1, name="the reference profiles of real modules", reread="Exercise 1.3")
+def deadline_reference(student):
+    for slug, mode, rate_hz in (("nano-4gb", "5W", 30.0), ("xavier-nx", "15W", 60.0), ("agx-orin-64gb", "MAXN", 90.0)):
+        tools.compare_deadline(student.deadline_slack_ms, tools.reference_profile(slug, mode), rate_hz)
 
 
 @suite.test("inflate", points=4, name="random maps with unknown cells", reread="Exercise 2.1")
@@ -187,10 +196,10 @@ def planner_drives(student):
     from robotbrain.ros import CallbackError
 
     try:
-        run = drive(5, difficulty=0.2, parts={"planner": student.MyPlanner}, time_limit=60.0)
+        run = drive(5, difficulty=0.2, profile=DEPLOYED, parts={"planner": student.MyPlanner}, time_limit=60.0)
     except CallbackError as error:
         fail(f"the node raised {type(error.cause).__name__} on the way")
-    expect(run.success, f"the robot {run.reason}")
+    expect(run.success, f"on the {DEPLOYED} the robot {run.reason}")
 
 
 @suite.test("evaluate", points=3, name="no success, all successes, one run", reread="Exercise 4")

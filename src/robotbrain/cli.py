@@ -27,6 +27,7 @@ COMMANDS: dict[str, Command] = {
     "demo": Command("robotbrain.demo", "grade the sample class, drive the robot, show one page"),
     "drive": Command("robotbrain.pipeline.commands:drive", "let a brain drive in worlds of your choice"),
     "lab": Command("robotbrain.jupyter", "open JupyterLab on the course"),
+    "jetson": Command("robotbrain.jetson.commands:jetson", "what a network takes on a Jetson module: the twin"),
     "train": Command("robotbrain.training.commands:train", "train a shipped network again"),
     "grade": Command("robotbrain.grading.commands:grade", "grade one notebook and print the report"),
     "grade-class": Command("robotbrain.grading.commands:grade_class", "grade all submissions of a lab"),

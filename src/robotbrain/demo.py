@@ -1,7 +1,7 @@
 """``robotbrain demo``: the main job in one command, and one page that shows what came of it.
 
 It generates the students' lab, makes the sample class, grades it with nbgrader, drives the reference brain on an
-emulated Jetson, and writes ``demo/index.html``.
+emulated Jetson, lets the same brain drive on a small, two middling and a large one, and writes ``demo/index.html``.
 """
 
 from __future__ import annotations
@@ -24,10 +24,13 @@ if TYPE_CHECKING:
     from robotbrain.grading.classroom import ClassResult
     from robotbrain.grading.mutation import Row
     from robotbrain.pipeline.brain import RunResult
+    from robotbrain.pipeline.devices import DeviceSummary
 
 LAB = "lab_integration"
 SEEDS = (1, 2, 3)
 PROFILE = "orin-nano-8gb"
+DEVICE_SEEDS = (8000, 8001, 8002, 8003)
+"""Worlds in which the Jetsons are compared."""
 _KINDS = {"reference": "reference", "style": "right, in another style", "mutant": "planted mistake"}
 
 
@@ -50,7 +53,8 @@ def main(arguments: argparse.Namespace) -> int:
     verdicts = mutation.judge(result.to_dict(), manifest)
     print(mutation.table(verdicts))
     runs = _drive()
-    page = _write_page(out, result, manifest, verdicts, runs, time.perf_counter() - began)
+    devices = _compare()
+    page = _write_page(out, result, manifest, verdicts, runs, devices, time.perf_counter() - began)
     wrong = [row for row in verdicts if row.problems]
     print(f"\n{len(verdicts)} submissions graded, {len(wrong)} of them not as they should be.")
     print(f"{sum(run.success for run in runs)} of {len(runs)} drives reached the goal.")
@@ -102,18 +106,43 @@ def _drive() -> list[RunResult]:
     return runs
 
 
+def _compare() -> list[DeviceSummary]:
+    from tqdm import tqdm
+
+    from robotbrain.pipeline import devices
+
+    print("4. The same brain on other Jetsons, charged for a 640x480 camera and a network of ResNet-50's size")
+    small = devices.DEVICES[0]
+    with tqdm(total=(len(devices.DEVICES) + 1) * len(DEVICE_SEEDS), unit="drive", file=sys.stderr, disable=None) as bar:
+
+        def progress(run: RunResult) -> None:
+            bar.set_postfix_str(f"{run.profile} {run.power_mode}", refresh=False)
+            bar.update()
+
+        summaries = devices.compare_devices(DEVICE_SEEDS, label="one thread", progress=progress)
+        apart = devices.detector_deployment(one_thread=False)
+        summaries += devices.compare_devices(
+            DEVICE_SEEDS, [small], deployment=apart, label="node by node", progress=progress
+        )
+    print(devices.table(summaries))
+    return summaries
+
+
 def _write_page(
     out: Path,
     result: ClassResult,
     manifest: dict[str, dict[str, Any]],
     verdicts: Sequence[Row],
     runs: Sequence[RunResult],
+    devices: Sequence[DeviceSummary],
     seconds: float,
 ) -> Path:
     for run in runs:
         run.replay().to_html(out / f"replay-{run.seed}.html", title=f"World {run.seed}")
     with atomic_path(out / "paths.png") as temporary:
         alt = _plot_paths(runs, temporary)
+    with atomic_path(out / "devices.png") as temporary:
+        devices_alt = _plot_devices(devices, temporary)
     mutants = [row for row in verdicts if row.kind == "mutant"]
     caught = sum(not row.problems for row in mutants)
     parts = [
@@ -124,6 +153,8 @@ def _write_page(
         f"<h2>World {runs[0].seed} in 3D</h2><p>Drag to turn, scroll to zoom. Blue is the plan, orange the way"
         f' driven. <a href="replay-{runs[0].seed}.html">Full page</a></p>'
         f'<iframe src="replay-{runs[0].seed}.html" title="3D replay of world {runs[0].seed}"></iframe>',
+        f"<h2>The same brain on other Jetsons</h2>{_device_table(devices)}",
+        f'<img src="devices.png" alt="{html.escape(devices_alt)}">',
         f"<h2>The class</h2><p>{len(result.rows)} submissions, graded by nbgrader. {caught} of {len(mutants)} planted"
         " mistakes lost their own points, and only these, and showed their own hint. A name leads to the feedback that"
         " the student gets.</p>",
@@ -147,6 +178,35 @@ def _plot_paths(runs: Sequence[RunResult], path: Path) -> str:
     plt.close(figure)
     drives = "; ".join(f"world {r.seed}: {r.reason} after {r.path_length:.1f} m" for r in runs)
     return f"The rooms from above with walls, shelves, boxes, the goal and the path driven. {drives}."
+
+
+def _plot_devices(devices: Sequence[DeviceSummary], path: Path) -> str:
+    from robotbrain.pipeline.devices import plot_devices
+
+    figure, alt = plot_devices(devices)
+    figure.savefig(path, dpi=110, format="png")
+    return alt
+
+
+def _device_table(devices: Sequence[DeviceSummary]) -> str:
+    rows = "".join(
+        f"<tr><th scope=row>{html.escape(s.name)}, {html.escape(s.power_mode)}</th><td>{html.escape(s.label)}</td>"
+        f"<td>{s.network_ms:.1f}</td><td>{s.control_hz:.1f}</td><td>{s.e2e_p50_ms:.0f}</td><td>{s.e2e_p99_ms:.0f}</td>"
+        f"<td class={'full' if s.successes == s.runs else 'lost'}>{s.successes} of {s.runs}</td>"
+        f"<td>{s.power_w:.1f}</td><td>{s.energy_j_per_m:.0f}</td></tr>"
+        for s in devices
+    )
+    return (
+        "<div class=wide><table><thead><tr><th scope=col>Jetson</th><th scope=col>nodes</th>"
+        "<th scope=col>network (ms)</th><th scope=col>control rate (Hz)</th><th scope=col>end to end, median (ms)</th>"
+        "<th scope=col>99th percentile (ms)</th><th scope=col>worlds solved</th><th scope=col>module (W)</th>"
+        f"<th scope=col>energy (J/m)</th></tr></thead><tbody>{rows}</tbody></table></div>"
+        "<p>What the robot sees is the same everywhere; what its work takes is not. It is charged for a 640 x 480 camera"
+        " and a network of ResNet-50's size. <em>One thread</em>: all nodes under one <code>rclpy.spin</code>, so"
+        " that each inference holds up the controller. <em>Node by node</em>: a process for each node. Latencies and power"
+        " are predicted (<code>robotbrain jetson show</code> gives their origin); CPU times are those of Python nodes,"
+        " scaled by a published single-thread benchmark.</p>"
+    )
 
 
 def _drive_table(runs: Sequence[RunResult]) -> str:

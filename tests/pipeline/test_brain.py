@@ -11,7 +11,7 @@ import pytest
 
 from robotbrain.errors import InputError
 from robotbrain.jetson import load_profile
-from robotbrain.pipeline.brain import GOAL_RADIUS, ProfileCosts, drive
+from robotbrain.pipeline.brain import GOAL_RADIUS, drive
 from robotbrain.pipeline.nodes.controller import thin_out
 from robotbrain.pipeline.nodes.mission import MissionNode
 from robotbrain.pipeline.nodes.perception import PerceptionNode
@@ -42,22 +42,16 @@ def test_one_seed_gives_one_log_and_two_seeds_two() -> None:
 
 
 def test_a_slower_jetson_answers_later_by_what_its_profile_says() -> None:
-    fast = drive(5, time_limit=3.0, profile="agx-orin-64gb")
-    slow = drive(5, time_limit=3.0, profile="nano-4gb")
-    # inference and the callback's own CPU time, nothing waits: 0.9 + 1.75 ms and 12 + 10 ms
-    assert np.median(fast.perception_ms) == pytest.approx(0.9 + 1.75, abs=1e-6)
-    assert np.median(slow.perception_ms) == pytest.approx(12.0 + 10.0, abs=1e-6)
-    assert fast.log_sha256 != slow.log_sha256
-
-
-def test_a_node_pays_for_its_role_whatever_it_is_called() -> None:
-    costs = ProfileCosts(load_profile("nano-4gb"))
-    costs.assign("/my_perception", "perception")
-    costs.assign("/c", "controller")
-    assert costs.cost("/my_perception", "subscription", "/camera/image") == 10_000_000
-    assert costs.cost("/my_perception", "subscription", "/camera/depth") == 0
-    assert costs.cost("/c", "timer", "any_name") == 2_400_000
-    assert costs.cost("/stranger", "timer", "_control") == 0
+    fast, slow = load_profile("agx-orin-64gb"), load_profile("nano-4gb:5W")
+    runs = [drive(5, time_limit=3.0, profile=profile) for profile in (fast, slow)]
+    for run, profile in zip(runs, (fast, slow), strict=True):
+        # Inference and the callback's own CPU time. The scan is due at the same time, so they may share a core; the
+        # typical callback has seen more points than this one.
+        alone = profile.segmentation_ms + profile.callback_ms["perception"]
+        assert np.median(run.perception_ms) == pytest.approx(alone, rel=0.35)
+        assert run.perception_ms.min() > profile.segmentation_ms
+    assert np.median(runs[0].perception_ms) < np.median(runs[1].perception_ms)
+    assert runs[0].log_sha256 != runs[1].log_sha256
 
 
 def blind(seed: int) -> type[PerceptionNode]:
@@ -195,7 +189,7 @@ def test_a_pose_that_is_no_number_is_named_with_its_topic() -> None:
         ({"parts": {"pilot": PlannerNode}}, "pilot"),
         ({"parts": {"planner": 3}}, "class that makes a node"),
         ({"robot": "real"}, "surrogate"),
-        ({"profile": "orin"}, "Jetson profile"),
+        ({"profile": "orin"}, "Jetson module"),
         ({"model": "nowhere.onnx"}, "ONNX"),
     ],
 )

@@ -20,9 +20,22 @@ class OnnxEngine:
     Args:
         model: path of the ONNX file.
         profile: the Jetson it is deployed to; None means an inference takes no simulated time.
+        image_size: (width, height) of the images whose latency is charged; None: those that it infers.
+        charged_as: ONNX file whose latency is charged; None: that of ``model``.
+
+    Attributes:
+        path: of the ONNX file.
+        profile: as given.
+        resource: of the device that an inference occupies: ``charge(engine.latency_ns, engine.resource)``.
     """
 
-    def __init__(self, model: str | Path, profile: JetsonProfile | None = None) -> None:
+    def __init__(
+        self,
+        model: str | Path,
+        profile: JetsonProfile | None = None,
+        image_size: tuple[int, int] | None = None,
+        charged_as: str | Path | None = None,
+    ) -> None:
         import onnxruntime
 
         path = Path(model)
@@ -48,7 +61,12 @@ class OnnxEngine:
                 expected="a valid ONNX file",
                 fix=f"ONNX Runtime says: {str(error).splitlines()[0][:200]}",
             ) from error
+        self.path = path
         self.profile = profile
+        self.resource = "gpu"
+        self._image_size = image_size
+        self._charged_as = path if charged_as is None else Path(charged_as)
+        self._latency_ns: int | None = None
         self._input = self._session.get_inputs()[0]
         self._output: str = self._session.get_outputs()[0].name
 
@@ -59,8 +77,12 @@ class OnnxEngine:
 
     @property
     def latency_ns(self) -> int:
-        """Time of one inference on the profile's module, ns."""
-        return 0 if self.profile is None else round(self.profile.segmentation_ms * 1e6)
+        """Time that is charged for one inference on the profile's module, ns; 0 without a profile."""
+        if self.profile is None:
+            return 0
+        if self._latency_ns is None:
+            self._latency_ns = round(self.profile.network_ms(self._charged_as, image_size=self._image_size) * 1e6)
+        return self._latency_ns
 
     def infer(self, batch: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the network's output for one input.

@@ -12,7 +12,7 @@ COMPUTE_OPS = ("conv", "dw", "mm")
 """Kernels that multiply and accumulate: dense or grouped convolution, depthwise convolution, matrix product."""
 
 MEMORY_OPS = ("pw", "mem")
-"""Kernels that only move data: pointwise arithmetic (``pw``) and everything else (``mem:pool``, ``mem:softmax``, ...)."""
+"""Kernels that only move data: pointwise arithmetic (``pw``) and everything else (``mem:pool``, ...)."""
 
 PRECISIONS = ("fp32", "fp16", "int8")
 """Precisions a kernel can run in."""

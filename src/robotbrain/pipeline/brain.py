@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import operator
-import struct
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -15,11 +14,13 @@ from numpy.typing import NDArray
 
 from robotbrain.errors import InputError
 from robotbrain.jetson.profiles import JetsonProfile, load_profile
+from robotbrain.pipeline.costs import ProfileCosts
+from robotbrain.pipeline.deployment import Deployment
+from robotbrain.pipeline.watch import Watch
 
 if TYPE_CHECKING:
     from rclpy.node import Node
 
-    from robotbrain.ros.context import CallbackRecord
     from robotbrain.sim import RobotSim, World
     from robotbrain.sim.view import Replay
 
@@ -57,6 +58,15 @@ class RunResult:
         goal_distance: from the robot's centre to the marker's centre at the end, m.
         collisions: names of what was touched.
         log_sha256: digest of every message published, in order.
+        power_mode: of that Jetson.
+        control_hz: commands published per second, from the first to the last.
+        camera_age_ms, scan_age_ms: of each command, once there is such an input: how long before the command's release
+            the newest input that it was built on was taken, ms. For the camera: the newest image whose obstacle points
+            the controller had; for the scan: the newest scan matched into the pose that the controller had. Both hold
+            the sensor's period as well as the latency (a saw-tooth from the latency up to the latency plus a period).
+        busy: share of its capacity that each resource of the Jetson was busy, 0 to 1.
+        deadline_misses: callbacks by name (``controller``, ``perception``, ``estimator_scan``, ``estimator_wheels``)
+            that ended later than one period of their timer or sensor after they were due, or were dropped before that.
         perception_ms: from taking an image to publishing its segmentation, for each image, ms.
         planning_ms: of each answered plan request, from its arrival to its answer, ms.
         trajectory: (T, 4) true time s, x m, y m, yaw rad, ten a second.
@@ -77,6 +87,12 @@ class RunResult:
     goal_distance: float
     collisions: tuple[str, ...]
     log_sha256: str
+    power_mode: str
+    control_hz: float
+    camera_age_ms: NDArray[np.float64] = field(repr=False)
+    scan_age_ms: NDArray[np.float64] = field(repr=False)
+    busy: Mapping[str, float]
+    deadline_misses: Mapping[str, int]
     perception_ms: NDArray[np.float64] = field(repr=False)
     planning_ms: NDArray[np.float64] = field(repr=False)
     trajectory: NDArray[np.float64] = field(repr=False)
@@ -90,6 +106,11 @@ class RunResult:
     def real_time_factor(self) -> float:
         """Simulated seconds per real second."""
         return self.seconds / self.wall_seconds
+
+    @property
+    def e2e_ms(self) -> NDArray[np.float64]:
+        """End-to-end latency of each command, sensor to actuator: the age of the older of its two inputs, ms."""
+        return np.maximum(self.camera_age_ms, self.scan_age_ms)
 
     def replay(self) -> Replay:
         """Return the run as a replay to watch in 3D: ``run.replay().show()`` in a notebook."""
@@ -106,44 +127,12 @@ class RunResult:
         return replay
 
 
-class ProfileCosts:
-    """Simulated CPU time of the brain's callbacks on a Jetson profile (a cost model for ``robotbrain.ros``).
-
-    Costs go by a node's role, whatever it is called: by topic for subscriptions, one price for a role's timers and
-    one for the plan service. The inference itself and the reference planner's search charge their own time on top.
-    """
-
-    _TOPICS: Mapping[tuple[str, str], str] = {
-        ("perception", "/camera/image"): "perception",
-        ("estimator", "/scan"): "estimator_scan",
-        ("estimator", "/joint_states"): "estimator_wheels",
-        ("mapper", "/scan"): "mapper",
-        ("mapper", "/perception/points"): "mapper",
-    }
-    _TIMERS = ("mission", "controller")
-
-    def __init__(self, profile: JetsonProfile) -> None:
-        self._topics = {key: profile.callback_ns(name) for key, name in self._TOPICS.items()}
-        self._timers = {role: profile.callback_ns(role) for role in self._TIMERS}
-        self._plan = profile.planning_ns(0)
-        self._roles: dict[str, str] = {}
-
-    def assign(self, node_name: str, role: str) -> None:
-        """Say which role the node of this fully qualified name plays."""
-        self._roles[node_name] = role
-
-    def cost(self, node_name: str, kind: str, name: str) -> int:
-        """Return the cost of one callback in ns; 0 for callbacks that only store a message."""
-        role = self._roles.get(node_name, "")
-        if kind == "service":
-            return self._plan if role == "planner" else 0
-        if kind == "timer":
-            return self._timers.get(role, 0)
-        return self._topics.get((role, name), 0)
-
-
 def make_parts(
-    profile: JetsonProfile, sim: RobotSim, model: str | Path | None = None, overrides: Parts | None = None
+    profile: JetsonProfile,
+    sim: RobotSim,
+    model: str | Path | None = None,
+    overrides: Parts | None = None,
+    deployment: Deployment | None = None,
 ) -> dict[str, Callable[[], Node]]:
     """Return a factory for each role, the kit's own unless overridden.
 
@@ -158,18 +147,17 @@ def make_parts(
     from robotbrain.pipeline.nodes.perception import PerceptionNode
     from robotbrain.pipeline.nodes.planner import PlannerNode
 
-    mounting = sim.camera.extrinsics
-
-    def planning_ns(expanded: int) -> int:
-        return profile.planning_ns(expanded) - profile.planning_ns(0)
-
+    deployed = deployment or Deployment()
+    mount = sim.camera.extrinsics
+    mounting = (mount.x, mount.y, mount.z, mount.pitch)
     parts: dict[str, Callable[[], Any]] = {
         "perception": lambda: PerceptionNode(
-            OnnxEngine(model or default_model(), profile), (mounting.x, mounting.y, mounting.z, mounting.pitch)
+            OnnxEngine(model or default_model(), profile, deployed.image_size, deployed.network),
+            mounting,
         ),
         "estimator": lambda: EstimatorNode(sim.robot.wheel_radius, sim.robot.track),
         "mapper": MapperNode,
-        "planner": lambda: PlannerNode(planning_ns=planning_ns),
+        "planner": PlannerNode,
         "mission": MissionNode,
         "controller": ControllerNode,
     }
@@ -193,6 +181,8 @@ def drive(
     difficulty: float = 0.5,
     robot: RobotKind = "nominal",
     profile: str | JetsonProfile = "orin-nano-8gb",
+    mode: str | int | None = None,
+    deployment: Deployment | None = None,
     parts: Parts | None = None,
     model: str | Path | None = None,
     time_limit: float = TIME_LIMIT,
@@ -205,23 +195,26 @@ def drive(
         difficulty: of the world, 0 to 1.
         robot: the nominal robot, or the surrogate (a stand-in for a physical one: the same robot with other friction,
             mass, motor lag, backlash, sensor errors and delays).
-        profile: the Jetson that the brain runs on; a slug or a profile.
+        profile: the Jetson that the brain runs on; a slug such as ``nano-4gb`` or ``nano-4gb:5W``, or a profile.
+        mode: its power mode; None for its default, or that of the profile.
+        deployment: which sensors are charged for, and how nodes share threads; see Deployment.
         parts: nodes of your own by role, see ROLES.
         model: ONNX file of the segmentation network; the shipped one by default.
         time_limit: s.
         surrogate_seed: which surrogate.
 
     Raises:
-        InputError: for unknown roles, robots or profiles.
+        InputError: for unknown roles, robots, profiles or power modes.
         robotbrain.ros.exceptions.CallbackError: if a node's callback raises; its cause is the node's own error.
     """
-    from robotbrain.ros import SimContext
+    from robotbrain.ros import DeviceResources, SimContext
+    from robotbrain.ros.executors import SingleThreadedExecutor
     from robotbrain.ros.record import DecisionLog
     from robotbrain.sim import RobotSim, World, generate_world
 
     if robot not in ("nominal", "surrogate"):
         raise InputError("robot", given=robot, expected="'nominal' or 'surrogate'", fix="Choose one of the two.")
-    chosen = load_profile(profile) if isinstance(profile, str) else profile
+    chosen = _chosen_profile(profile, mode)
     world = seed if isinstance(seed, World) else generate_world(operator.index(seed), difficulty)
     noise_seed = world.spec.seed
     if robot == "surrogate":
@@ -231,25 +224,32 @@ def drive(
         sim = RobotSim(world, body, sensors, seed=noise_seed)
     else:
         sim = RobotSim(world, seed=noise_seed)
-    costs = ProfileCosts(chosen)
-    context = SimContext(cost_model=costs)
+    deployed = deployment or Deployment()
+    camera = sim.camera.intrinsics
+    costs = ProfileCosts(chosen, deployed.scales(camera.width * camera.height, sim.lidar.spec.rays))
+    device = DeviceResources(cpu_cores=chosen.cpu_cores, gpu=1, dla=chosen.dla)
+    context = SimContext(cost_model=costs, resources=device)
     log = DecisionLog(context)
-    watch = _Watch(context)
+    watch = Watch(context, costs)
     with context.as_default():
         from robotbrain.pipeline.nodes.robot import RobotNode
 
         RobotNode(sim)
-        for role, make in make_parts(chosen, sim, model, parts).items():
+        if deployed.one_thread:
+            shared = SingleThreadedExecutor(context=context)
+            context.default_executor_factory = lambda node: shared
+        for role, make in make_parts(chosen, sim, model, parts, deployed).items():
             before = set(context.nodes)
             make()
             for node in set(context.nodes) - before:
-                costs.assign(node.get_fully_qualified_name(), role)
+                costs.assign(node.get_fully_qualified_name(), role, foreign=role in (parts or {}))
         began = time.perf_counter()
         try:
             reason, success = _run(context, sim, watch, time_limit)
         finally:
             context.try_shutdown()
         wall_seconds = time.perf_counter() - began
+        watch.finish(context)
     return RunResult(
         seed=world.spec.seed,
         robot=robot,
@@ -261,6 +261,12 @@ def drive(
         goal_distance=sim.truth.distance_to_goal,
         collisions=tuple(sorted(sim.truth.collided)),
         log_sha256=log.sha256(),
+        power_mode=chosen.power_mode,
+        control_hz=watch.control_hz,
+        camera_age_ms=np.array(watch.camera_age_ms),
+        scan_age_ms=np.array(watch.scan_age_ms),
+        busy=device.utilisation(),
+        deadline_misses=dict(watch.deadline_misses),
         perception_ms=np.array(watch.perception_ms),
         planning_ms=np.array(watch.planning_ms),
         trajectory=np.array(watch.trajectory).reshape(-1, 4),
@@ -272,7 +278,20 @@ def drive(
     )
 
 
-def _run(context: Any, sim: RobotSim, watch: _Watch, time_limit: float) -> tuple[str, bool]:
+def _chosen_profile(profile: str | JetsonProfile, mode: str | int | None) -> JetsonProfile:
+    if isinstance(profile, str):
+        return load_profile(profile, mode)
+    if mode is not None and load_profile(profile.slug, mode).power_mode != profile.power_mode:
+        raise InputError(
+            "mode",
+            given=f"{mode!r} beside a profile in mode {profile.power_mode!r}",
+            expected="one power mode",
+            fix="Load the profile in that mode: load_profile(slug, mode).",
+        )
+    return profile
+
+
+def _run(context: Any, sim: RobotSim, watch: Watch, time_limit: float) -> tuple[str, bool]:
     step_ns = 100_000_000
     while context.now_ns < time_limit * 1e9:
         context.run_until(context.now_ns + step_ns)
@@ -294,46 +313,3 @@ def _run(context: Any, sim: RobotSim, watch: _Watch, time_limit: float) -> tuple
                 return "said it had arrived, but kept moving", False
             return "reached the goal", True
     return f"did not arrive within {time_limit:g} s", False
-
-
-class _Watch:
-    """Collects what a report needs from the messages that pass, and the truth for the judge."""
-
-    def __init__(self, context: Any) -> None:
-        self.perception_ms: list[float] = []
-        self.planning_ms: list[float] = []
-        self.plans: list[tuple[float, NDArray[np.float64]]] = []
-        self.trajectory: list[tuple[float, float, float, float]] = []
-        self.boxes: list[list[tuple[float, float, float]]] = []
-        self.marker: tuple[float, float] | None = None
-        self.reached = False
-        context.add_tap(self._on_message)
-        context.add_callback_tap(self._on_callback)
-
-    def sample(self, sim: RobotSim, now: float) -> None:
-        pose = sim.truth.pose
-        self.trajectory.append((now, pose.x, pose.y, pose.yaw))
-        self.boxes.append([(p.x, p.y, p.yaw) for p in sim.truth.obstacle_poses()])
-
-    def _on_message(self, time_ns: int, topic: str, type_name: str, _node: str, cdr: bytes) -> None:
-        if topic == "/perception/segmentation":
-            # CDR starts with four bytes of encapsulation, then the header's stamp.
-            seconds, nanoseconds = struct.unpack_from("<iI", cdr, 4)
-            self.perception_ms.append((time_ns - seconds * 1_000_000_000 - nanoseconds) * 1e-6)
-        elif topic in ("/plan", "/goal_pose", "/goal_reached"):
-            from rclpy.serialization import deserialize_message
-
-            from robotbrain.ros.conversions import msg_class
-
-            message: Any = deserialize_message(cdr, msg_class(type_name))
-            if topic == "/plan":
-                points = np.array([(p.pose.position.x, p.pose.position.y) for p in message.poses]).reshape(-1, 2)
-                self.plans.append((time_ns * 1e-9, points))
-            elif topic == "/goal_reached":
-                self.reached |= bool(message.data)
-            else:
-                self.marker = (message.pose.position.x, message.pose.position.y)
-
-    def _on_callback(self, record: CallbackRecord) -> None:
-        if record.kind == "service" and record.name == "/plan":
-            self.planning_ms.append((record.end_ns - record.ready_ns) * 1e-6)

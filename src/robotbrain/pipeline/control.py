@@ -114,10 +114,16 @@ class PathTracker:
 
     Args:
         params: limits and gains.
+
+    Attributes:
+        arcs: arcs that the last :meth:`command` checked.
+        distances: distances from a position along an arc to an obstacle point that it computed for that. These two are
+            its units of CPU work.
     """
 
     def __init__(self, params: ControlParams | None = None) -> None:
         self.params = params or ControlParams()
+        self.arcs = self.distances = 0
         self._blocked_since: float | None = None
         self._backing_until = -1.0
 
@@ -139,6 +145,7 @@ class PathTracker:
             obstacles: (M, 2) points in the robot's frame, m.
         """
         p = self.params
+        self.arcs = self.distances = 0
         if len(path) == 0:
             self._blocked_since = None
             return Command(0.0, 0.0, "idle")
@@ -159,7 +166,7 @@ class PathTracker:
         speed = min(p.max_speed, 0.08 + 0.9 * remaining, p.max_turn / max(abs(curvature), 1e-6))
         speed *= max(0.25, np.cos(bearing) ** 2)
         ahead = near[near[:, 0] > -0.05] if len(near) else near
-        clearance = arc_clearance(0.0, 0.0, ahead, 0.0, 1) - p.radius
+        clearance = self._clearance(0.0, 0.0, ahead, 0.0, 1) - p.radius
         speed *= float(np.clip(clearance / p.slow_distance, 0.3, 1.0))
         for factor in (1.0, 0.7, 0.45, 0.25):
             tried = factor * speed
@@ -173,11 +180,18 @@ class PathTracker:
     def _free(self, speed: float, turn: float, points: NDArray[np.float64], horizon: float) -> bool:
         """Whether an arc keeps its margin, or at least leads away from what is already too near."""
         limit = self.params.radius + self.params.margin
-        now = arc_clearance(0.0, 0.0, points, 0.0, 1)
-        along = arc_clearance(speed, turn, points, horizon)
+        now = self._clearance(0.0, 0.0, points, 0.0, 1)
+        along = self._clearance(speed, turn, points, horizon)
         if now >= limit:
             return along >= limit
         return along >= now - 1e-3
+
+    def _clearance(
+        self, speed: float, turn: float, points: NDArray[np.float64], horizon: float, steps: int = 12
+    ) -> float:
+        self.arcs += 1
+        self.distances += len(points) * steps
+        return arc_clearance(speed, turn, points, horizon, steps)
 
     def _turn_to(self, pose: Pose, final_yaw: float | None) -> Command:
         if final_yaw is None:

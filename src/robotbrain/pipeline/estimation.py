@@ -177,10 +177,15 @@ class ScanMatch:
 
 
 class ScanMatcher:
-    """Matches scans to the scans kept so far, by point-to-line ICP."""
+    """Matches scans to the scans kept so far, by point-to-line ICP.
+
+    Attributes:
+        queries: nearest neighbours looked up by the last :meth:`match` (its unit of CPU work).
+    """
 
     def __init__(self, params: MatchParams | None = None) -> None:
         self.params = params or MatchParams()
+        self.queries = 0
         self._keyframes: list[tuple[Pose, NDArray[np.float64], NDArray[np.float64]]] = []
         self._tree: cKDTree | None = None
         self._points = np.zeros((0, 2))
@@ -191,8 +196,14 @@ class ScanMatcher:
         """How many scans are kept."""
         return len(self._keyframes)
 
+    @property
+    def point_count(self) -> int:
+        """How many points the kept scans have."""
+        return len(self._points)
+
     def match(self, points: NDArray[np.float64], guess: Pose) -> ScanMatch | None:
         """Return where ``points`` (N, 2), given in the robot's frame, fit best near ``guess``, or None."""
+        self.queries = 0
         if self._tree is None or len(points) < self.params.min_pairs:
             return None
         p = self.params
@@ -202,6 +213,7 @@ class ScanMatcher:
         residual = np.zeros(0)
         for _ in range(p.iterations):
             world = transform(pose, points)
+            self.queries += len(points)
             distance, index = self._tree.query(world, distance_upper_bound=reject)
             used = np.isfinite(distance)
             if int(used.sum()) < p.min_pairs:

@@ -39,12 +39,17 @@ class ViewMemory:
     Args:
         frame: grid of the map.
         params: the camera's reach.
+
+    Attributes:
+        looked: cells that the last :meth:`look` went through (its unit of CPU work).
+        searched: cells that the last :meth:`next_target` went through.
     """
 
     def __init__(self, frame: GridFrame, params: ViewParams | None = None) -> None:
         self.frame = frame
         self.params = params or ViewParams()
         self.reach = self.params.reach
+        self.looked = self.searched = 0
         self.viewed = np.zeros(frame.shape, dtype=bool)
         self._rejected = np.zeros(frame.shape, dtype=bool)
 
@@ -59,6 +64,7 @@ class ViewMemory:
             np.asarray(pose[:2]) + along[None, :, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)[:, None, :]
         )
         cells = self.frame.to_cells(points)
+        self.looked = cells.size // 2
         inside = self.frame.inside(cells)
         rows = np.clip(cells[..., 0], 0, self.frame.shape[0] - 1)
         columns = np.clip(cells[..., 1], 0, self.frame.shape[1] - 1)
@@ -102,12 +108,14 @@ class ViewMemory:
         """
         p = self.params
         known = occupancy != UNKNOWN
+        self.searched = 0
         rows, columns = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
         if rows.size == 0:
             return None
         top, left = int(rows.min()), int(columns.min())
         window = (slice(top, int(rows.max()) + 1), slice(left, int(columns.max()) + 1))
         grid = occupancy[window]
+        self.searched = grid.size
         obstacle = grid >= OCCUPIED_FROM
         distance = ndimage.distance_transform_edt(~obstacle) if obstacle.any() else np.full(grid.shape, np.inf)
         open_cells = (grid != UNKNOWN) & (np.asarray(distance) * self.frame.resolution > p.clearance)

@@ -45,11 +45,15 @@ class OccupancyMapper:
     Args:
         frame: where the grid lies in the map frame.
         params: sensor models.
+
+    Attributes:
+        written: points, free and occupied, that the last observation brought (the mapper's unit of CPU work).
     """
 
     def __init__(self, frame: GridFrame, params: MapParams | None = None) -> None:
         self.frame = frame
         self.params = params or MapParams()
+        self.written = 0
         self._lidar = np.zeros(frame.shape, dtype=np.float32)
         self._camera = np.zeros(frame.shape, dtype=np.float32)
         self._lidar_seen = np.zeros(frame.shape, dtype=bool)
@@ -116,6 +120,7 @@ class OccupancyMapper:
         hit: float,
     ) -> None:
         """Count each cell once per observation; an occupied verdict wins over a free one."""
+        self.written = len(free) + len(occupied)
         cells_free, cells_occupied = self._flat(free), self._flat(occupied)
         cells = np.concatenate([cells_free, cells_occupied])
         order = np.arange(len(cells))

@@ -327,10 +327,14 @@ class PlanResult:
     Attributes:
         points: (N, 2) x, y in the map frame, m; None where there is no route.
         expanded: cells expanded by A*.
+        cells: of the grid that was inflated and searched.
+        path_cells: cells of the path that A* found, before it was straightened.
     """
 
     points: NDArray[np.float64] | None
     expanded: int
+    cells: int = 0
+    path_cells: int = 0
 
 
 def plan_path(
@@ -353,16 +357,16 @@ def plan_path(
     begin = nearest_free(cost, start_cell, int(0.5 / frame.resolution))
     end = nearest_free(cost, goal_cell, int(tolerance / frame.resolution))
     if begin is None or end is None:
-        return PlanResult(None, 0)
+        return PlanResult(None, 0, grid.size)
     found = astar_search(cost, begin, end)
     if found.path is None:
-        return PlanResult(None, found.expanded)
+        return PlanResult(None, found.expanded, grid.size)
     inner = frame.to_points(smooth(found.path, cost))[1:-1]
     last = np.asarray(goal, dtype=float) if end == goal_cell else frame.to_points(end)
     # A start in the lethal zone leaves it by the cell that the search began at, not across the zone.
     first = [start] if begin == start_cell else [start, frame.to_points(begin)]
     points = np.concatenate([first, inner, [last]])
-    return PlanResult(resample(points, 2 * frame.resolution), found.expanded)
+    return PlanResult(resample(points, 2 * frame.resolution), found.expanded, grid.size, len(found.path))
 
 
 def _crop(

@@ -5,16 +5,18 @@ import GetPlan`` … resolve to the kit when genuine rclpy is absent; when it is
 and :data:`BACKEND` is ``"rclpy"``. Set the environment variable ``ROBOTBRAIN_ROS_BACKEND=kit`` to simulate on
 a machine that has ROS 2.
 
-The simulation itself is :class:`SimContext`; :func:`charge` adds simulated time to the running callback.
+The simulation itself is :class:`SimContext`; :func:`charge` and :func:`charge_work` add to the cost of the running
+callback, and :class:`DeviceResources` are what callbacks share.
 """
 
 from __future__ import annotations
 
 import os
 
-from robotbrain.ros.api import charge
+from robotbrain.ros.api import charge, charge_work
 from robotbrain.ros.context import CallbackRecord, CostModel, SimContext
 from robotbrain.ros.exceptions import CallbackError, ReentrancyError, SimulationDeadlockError
+from robotbrain.ros.resources import DeviceResources
 from robotbrain.ros.shim import install as _install
 from robotbrain.ros.shim import uninstall as _uninstall
 
@@ -23,10 +25,12 @@ __all__ = [
     "CallbackError",
     "CallbackRecord",
     "CostModel",
+    "DeviceResources",
     "ReentrancyError",
     "SimContext",
     "SimulationDeadlockError",
     "charge",
+    "charge_work",
     "install",
     "uninstall",
 ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from robotbrain.ros import context as _context
 from robotbrain.ros.context import SimContext, get_default_context, peek_default_context, set_default_context
 from robotbrain.ros.executors import Executor, SingleThreadedExecutor
 from robotbrain.ros.logging import RcutilsLogger, get_logger
@@ -14,6 +15,7 @@ __all__ = [
     "Future",
     "RcutilsLogger",
     "charge",
+    "charge_work",
     "create_node",
     "get_default_context",
     "get_global_executor",
@@ -127,16 +129,31 @@ def spin_until_future_complete(
     _spinner(node, executor).spin_until_future_complete(future, timeout_sec)
 
 
-def charge(nanoseconds: int) -> bool:
+def charge(nanoseconds: int, resource: str = "cpu") -> bool:
     """Add ``nanoseconds`` of simulated time to the cost of the callback that is running now.
 
-    This is how a timed inference engine adds its latency. Outside callbacks, and without a kit context, it
-    does nothing.
+    This is how a timed inference engine adds its latency: ``charge(engine.latency_ns, engine.resource)``. Outside
+    callbacks, and without a kit context, it does nothing.
+
+    Args:
+        nanoseconds: >= 0.
+        resource: where the time is spent: ``cpu``, ``gpu``, ``dla0`` or ``dla1``.
 
     Returns:
         Whether it was charged.
     """
-    from robotbrain.ros import context as context_module
+    active = _context.active_context()
+    return active.charge(nanoseconds, resource) if active is not None else False
 
-    active = context_module.active_context()
-    return active.charge(nanoseconds) if active is not None else False
+
+def charge_work(kind: str, units: float) -> bool:
+    """Add CPU work to the cost of the callback that is running now, e.g. ``charge_work("astar", expanded)``.
+
+    The simulation's cost model turns units of work into time on its device. Outside callbacks, without a kit context
+    and without such a model it does nothing.
+
+    Returns:
+        Whether there was a callback to charge.
+    """
+    active = _context.active_context()
+    return active.charge_work(kind, units) if active is not None else False

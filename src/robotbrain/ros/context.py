@@ -17,6 +17,7 @@ from robotbrain.errors import InputError
 from robotbrain.ros.exceptions import CallbackError, NotInitializedException, ReentrancyError
 from robotbrain.ros.logging import LoggingSeverity, LogSink, RcutilsLogger, print_sink
 from robotbrain.ros.names import NodeArguments, parse_arguments
+from robotbrain.ros.resources import RESOURCES, DeviceResources, Segment
 
 if TYPE_CHECKING:
     from robotbrain.ros.executors import Executor
@@ -30,7 +31,15 @@ CallbackTap = Callable[["CallbackRecord"], None]
 
 
 class CostModel(Protocol):
-    """How long callbacks take."""
+    """How long callbacks take.
+
+    A model may have three more methods, all of which return ns of CPU time:
+
+    - ``work_ns(kind, units)``: of work that a callback did and names by :func:`robotbrain.ros.charge_work`;
+    - ``uncharged_ns(node_name, kind, name)``: of a callback that charged nothing itself;
+    - ``traffic_ns(node_name, received, sent)``: of taking a message of ``received`` bytes off the wire (None: there
+      was none) and putting messages of ``sent`` bytes each on it.
+    """
 
     def cost(self, node_name: str, kind: str, name: str) -> int:
         """Return the simulated nanoseconds of one callback.
@@ -45,7 +54,18 @@ class CostModel(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class CallbackRecord:
-    """One executed callback, for monitoring: became ready, started and ended at these simulated times (ns)."""
+    """One executed callback, for monitoring: became ready, started and ended at these simulated times (ns).
+
+    Attributes:
+        node: fully qualified name of its node.
+        kind: ``timer``, ``subscription``, ``service`` or ``client``.
+        name: topic or service name; for a timer the name of its callback function.
+        ready_ns: when it could have started, had its worker and callback group been free.
+        start_ns: when it started.
+        end_ns: when what it published was released, and its worker free again.
+        demand_ns: what it cost.
+        segments: the cost in order, as (resource, ns).
+    """
 
     node: str
     kind: str
@@ -53,6 +73,18 @@ class CallbackRecord:
     ready_ns: int
     start_ns: int
     end_ns: int
+    demand_ns: int = 0
+    segments: tuple[Segment, ...] = ()
+
+    @property
+    def queued_ns(self) -> int:
+        """How long it waited to be started."""
+        return self.start_ns - self.ready_ns
+
+    @property
+    def contention_ns(self) -> int:
+        """How much longer it took than it would have on an idle device."""
+        return self.end_ns - self.start_ns - self.demand_ns
 
 
 @dataclass(slots=True)
@@ -60,8 +92,18 @@ class Execution:
     """The callback that is running now: what it charged and what it has to release when its cost is over."""
 
     node: Node
-    charged_ns: int = 0
+    cost_model: CostModel | None = None
+    segments: list[Segment] = field(default_factory=list)
     outbox: list[tuple[Event, Any]] = field(default_factory=list)
+
+    def add(self, resource: str, nanoseconds: int) -> None:
+        """Append to the cost; CPU time that follows CPU time is one segment."""
+        segments = self.segments
+        if not nanoseconds:
+            return
+        if resource == "cpu" and segments and segments[-1][0] == "cpu":
+            nanoseconds += segments.pop()[1]
+        segments.append((resource, nanoseconds))
 
 
 class SimContext:
@@ -72,6 +114,8 @@ class SimContext:
             or a function ``(topic, size_bytes) -> ns``. Messages of one publisher never overtake each other.
         cost_model: what callbacks cost; an object with ``cost(node_name, kind, name) -> ns``, or None for 0.
         start_ns: simulated time at the start.
+        resources: of the device that all callbacks run on; None for no limit: each callback then takes the sum of its
+            segments, whatever else is running.
 
     Attributes:
         now_ns: simulated time in ns.
@@ -89,12 +133,16 @@ class SimContext:
         latency_ns: int | Callable[[str, int], int] = 0,
         cost_model: CostModel | None = None,
         start_ns: int = 0,
+        resources: DeviceResources | None = None,
     ) -> None:
         from robotbrain.ros.executors import SingleThreadedExecutor
 
         self.now_ns = start_ns
         self.latency_ns = latency_ns
         self.cost_model = cost_model
+        self.resources = resources
+        if resources is not None:
+            resources.attach(self)
         self.on_callback_error: Callable[[CallbackError], bool] | None = None
         self.default_executor_factory: Callable[[Node], Executor] = lambda node: SingleThreadedExecutor(context=self)
         self.log_sink: LogSink = print_sink
@@ -181,11 +229,15 @@ class SimContext:
         else:
             self.schedule(self.now_ns, event, argument)
 
-    def charge(self, nanoseconds: int) -> bool:
+    def charge(self, nanoseconds: int, resource: str = "cpu") -> bool:
         """Add to the cost of the running callback; return False (and do nothing) outside callbacks.
 
+        Args:
+            nanoseconds: how long ``resource`` is wanted.
+            resource: ``cpu``, ``gpu``, ``dla0`` or ``dla1``. What a callback charges runs in that order.
+
         Raises:
-            InputError: negative.
+            InputError: negative, or a resource that the device does not have.
         """
         if nanoseconds < 0:
             raise InputError(
@@ -194,10 +246,46 @@ class SimContext:
                 expected="nanoseconds >= 0",
                 fix="A callback cannot take less than no time.",
             )
+        if resource != "cpu":
+            self._check_resource(resource)
         if self.running is None:
             return False
-        self.running.charged_ns += int(nanoseconds)
+        self.running.add(resource, int(nanoseconds))
         return True
+
+    def charge_work(self, kind: str, units: float) -> bool:
+        """Add CPU work to the cost of the running callback; return False (and do nothing) outside callbacks.
+
+        The cost model says what it takes (``work_ns(kind, units)``); without such a model it is free.
+
+        Args:
+            kind: of work, as the cost model knows it, e.g. ``astar``.
+            units: how much, e.g. cells expanded; >= 0.
+
+        Raises:
+            InputError: units that are negative or no number; whatever the cost model refuses.
+        """
+        if not 0 <= units < float("inf"):
+            raise InputError(
+                f"charge_work of {kind!r}",
+                given=units,
+                expected="units >= 0",
+                fix="Count what was done, do not time it.",
+            )
+        if self.running is None:
+            return False
+        work_ns = getattr(self.running.cost_model, "work_ns", None)
+        if work_ns is not None:
+            self.running.add("cpu", work_ns(kind, units))
+        return True
+
+    def _check_resource(self, resource: str) -> None:
+        if self.resources is not None:
+            self.resources.check(resource)
+        elif resource not in RESOURCES:
+            raise InputError(
+                "resource", given=resource, expected="one of " + ", ".join(RESOURCES), fix="Choose one of these."
+            )
 
     def sleep(self, nanoseconds: int) -> bool:
         """Let time pass: charge it inside a callback, run the simulation for it outside; return ``ok()``."""

@@ -1,12 +1,10 @@
-"""Executors in simulated time (``rclpy.executors``): workers that callbacks occupy for as long as they cost.
+"""Executors in simulated time (``rclpy.executors``): workers that callbacks occupy for as long as they take.
 
-A callback that starts at time t and costs c reads the clock t; what it publishes and the responses it
-returns are released at t + c; its worker, and its mutually exclusive callback group, are busy until t + c.
-Ready callbacks start in the order in which they became ready.
-
-Shared resources (CPU cores of a device, one GPU, DLAs) are not modelled yet. They belong in
-:meth:`Executor._start`: the end time computed there becomes the answer of a resource model that is given the
-start time and the demands charged, and :meth:`Executor._finish` gives the resources back.
+A callback that starts at time t and ends at time e reads the clock t; what it publishes and the responses it
+returns are released at e; its worker, and its mutually exclusive callback group, are busy until e. It ends at
+t + c, where c is its cost, if it has the device to itself; where callbacks share a device, the context's
+:class:`~robotbrain.ros.resources.DeviceResources` say when. Ready callbacks start in the order in which they
+became ready.
 """
 
 # ruff: noqa: N818 - the names are those of rclpy.executors
@@ -22,6 +20,7 @@ from robotbrain.errors import InputError, RobotBrainError
 from robotbrain.ros.callback_groups import CallbackGroup
 from robotbrain.ros.context import CallbackRecord, CostModel, Execution, SimContext, get_default_context, set_running
 from robotbrain.ros.exceptions import CallbackError, ReentrancyError, SimulationDeadlockError
+from robotbrain.ros.resources import Segment
 from robotbrain.ros.task import Future
 
 if TYPE_CHECKING:
@@ -46,6 +45,15 @@ class Work:
         self.alive = True
 
 
+def message_size(payload: Any) -> int | None:
+    """Return the bytes of the CDR message in a piece of work or an event's argument; None when there is none."""
+    if isinstance(payload, bytes):
+        return len(payload)
+    if isinstance(payload, tuple):
+        return next((len(part) for part in payload if isinstance(part, bytes)), None)
+    return None
+
+
 class Executor:
     """Base of the executors.
 
@@ -67,6 +75,7 @@ class Executor:
         self.cost_model = cost_model
         self.executed = 0
         self._free = num_threads
+        self._priced_by: tuple[Any, Any, Any] = (None, None, None)
         self._ready: deque[Work] = deque()
         self._nodes: list[Node] = []
 
@@ -139,7 +148,8 @@ class Executor:
         if not work.resumed:
             group.active += 1
         self.executed += 1
-        execution = Execution(entity.node)
+        model = self.cost_model or context.cost_model
+        execution = Execution(entity.node, model)
         set_running(context, execution)
         failure: Exception | None = None
         suspended = False
@@ -149,33 +159,78 @@ class Executor:
             failure = error
         finally:
             set_running(context, None)
-            cost = execution.charged_ns
-            model = self.cost_model or context.cost_model
-            if model is not None and not work.resumed:
-                cost += model.cost(entity.node.get_fully_qualified_name(), entity.kind, entity.name)
-            end = context.now_ns + cost
-            for event, argument in execution.outbox:
-                context.schedule(end, event, argument)
+            if model is not None:
+                self._price(model, work, execution)
+            segments, started = execution.segments, context.now_ns
             freed = None if suspended else group
-            if cost > 0:
-                context.schedule(end, self._finish, freed)
-            else:
+            if not segments:
+                self._send(execution, started)
                 self._free += 1
                 if freed is not None:
                     freed.active -= 1
-        if context.callback_taps:
-            record = CallbackRecord(
-                entity.node.get_fully_qualified_name(),
-                entity.kind,
-                entity.name,
-                work.ready_ns,
-                context.now_ns,
-                end,
-            )
-            for tap in list(context.callback_taps):
-                tap(record)
+            elif context.resources is None:
+                end = started + sum([length for _, length in segments])
+                self._send(execution, end)
+                context.schedule(end, self._finish, freed)
+            else:
+                context.resources.submit(segments, lambda: self._complete(work, execution, started, freed))
+        if context.callback_taps and (not segments or context.resources is None):
+            self._record(work, segments, started, started + sum([length for _, length in segments]))
         if failure is not None:
             self._fail(work, failure)
+
+    def _price(self, model: CostModel, work: Work, execution: Execution) -> None:
+        """Add what the cost model says to what the callback charged itself."""
+        entity, segments = work.entity, execution.segments
+        node_name = entity.node.get_fully_qualified_name()
+        if model is not self._priced_by[0]:
+            self._priced_by = (model, getattr(model, "uncharged_ns", None), getattr(model, "traffic_ns", None))
+        _, uncharged_ns, traffic_ns = self._priced_by
+        first = 0
+        if not work.resumed:
+            first = model.cost(node_name, entity.kind, entity.name)
+            if not segments and uncharged_ns is not None:
+                first += uncharged_ns(node_name, entity.kind, entity.name)
+        if traffic_ns is not None:
+            received = None if work.resumed else message_size(work.payload)
+            if received is not None:
+                first += traffic_ns(node_name, received, ())
+            if execution.outbox:
+                sizes = [message_size(argument) for _, argument in execution.outbox]
+                execution.add("cpu", traffic_ns(node_name, None, [size for size in sizes if size is not None]))
+        if first:
+            # What the model adds comes before the callback's own work: the message is taken off the wire first.
+            if segments and segments[0][0] == "cpu":
+                segments[0] = ("cpu", segments[0][1] + first)
+            else:
+                segments.insert(0, ("cpu", first))
+
+    def _send(self, execution: Execution, time_ns: int) -> None:
+        for event, argument in execution.outbox:
+            self.context.schedule(time_ns, event, argument)
+
+    def _complete(self, work: Work, execution: Execution, started_ns: int, group: CallbackGroup | None) -> None:
+        """End a callback whose segments the device has done."""
+        now = self.context.now_ns
+        self._send(execution, now)
+        self.context.schedule(now, self._finish, group)
+        if self.context.callback_taps:
+            self._record(work, execution.segments, started_ns, now)
+
+    def _record(self, work: Work, segments: list[Segment], started_ns: int, end_ns: int) -> None:
+        entity = work.entity
+        record = CallbackRecord(
+            entity.node.get_fully_qualified_name(),
+            entity.kind,
+            entity.name,
+            work.ready_ns,
+            started_ns,
+            end_ns,
+            sum([length for _, length in segments]),
+            tuple(segments),
+        )
+        for tap in list(self.context.callback_taps):
+            tap(record)
 
     def _finish(self, group: CallbackGroup | None) -> None:
         self._free += 1

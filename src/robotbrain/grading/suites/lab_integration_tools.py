@@ -104,6 +104,14 @@ def profile(segmentation_ms: float, perception_ms: float) -> Any:
     return SimpleNamespace(segmentation_ms=segmentation_ms, callback_ms={"perception": perception_ms, "mapper": 7.0})
 
 
+def reference_profile(slug: str, mode: str) -> Any:
+    """Return the same of a real module, from its reference profile in ``autograder/profiles``."""
+    from robotbrain.jetson.reference import load_reference
+
+    reference = load_reference(slug)
+    return profile(reference.network("segmentation", mode).latency_ms, reference.callback_ms("perception", mode))
+
+
 def compare_deadline(slack: Callable[[Any, float], Any], module: Any, rate_hz: float) -> None:
     """Compare with the closed form."""
     inference, cpu = module.segmentation_ms, module.callback_ms["perception"]

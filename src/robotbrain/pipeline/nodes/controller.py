@@ -15,6 +15,7 @@ from robotbrain.pipeline.control import ControlParams, PathTracker
 from robotbrain.pipeline.geometry import Pose, inverse, transform
 from robotbrain.pipeline.nodes.perception import FLOOR_LABEL
 from robotbrain.pipeline.nodes.poses import StampedPoses, check_finite
+from robotbrain.ros import charge_work
 from robotbrain.ros.conversions import cloud_to_points, path_to_numpy, quaternion_to_yaw, scan_to_arrays, time_to_ns
 
 RATE_HZ = 20.0
@@ -70,6 +71,7 @@ class ControllerNode(Node):
         near = np.isfinite(ranges) & (ranges < 2.0)
         local = ranges[near, None] * np.stack([np.cos(angles[near]), np.sin(angles[near])], axis=1)
         stamp = time_to_ns(msg.header.stamp)
+        charge_work("near_points", len(ranges))
 
         def keep(pose: Pose) -> None:
             self._scan = _Sighting(stamp, transform(pose, local))
@@ -80,6 +82,7 @@ class ControllerNode(Node):
         points = cloud_to_points(msg).astype(np.float64)
         local = points[points[:, 2] != FLOOR_LABEL, :2]
         local = thin_out(local[np.hypot(local[:, 0], local[:, 1]) < 1.5])
+        charge_work("thin_out", len(points))
         stamp = time_to_ns(msg.header.stamp)
         if len(local):
             self._poses.when_known(stamp, lambda pose: self._seen.append(_Sighting(stamp, transform(pose, local))))
@@ -98,6 +101,10 @@ class ControllerNode(Node):
         now = self.get_clock().now().nanoseconds
         command = Twist()
         if pose is not None and self._scan is not None and now - self._scan.stamp_ns < SCAN_MAX_AGE * 1e9:
-            chosen = self._tracker.command(now * 1e-9, pose, self._path, self._final_yaw, self._obstacles(pose, now))
+            obstacles = self._obstacles(pose, now)
+            charge_work("obstacles", len(obstacles))
+            chosen = self._tracker.command(now * 1e-9, pose, self._path, self._final_yaw, obstacles)
+            charge_work("arcs", self._tracker.arcs)
+            charge_work("distances", self._tracker.distances)
             command.linear.x, command.angular.z = chosen.speed, chosen.turn
         self._publisher.publish(command)

@@ -10,6 +10,7 @@ from sensor_msgs.msg import Imu, JointState, LaserScan
 
 from robotbrain.pipeline.estimation import PoseFilter, ScanMatcher
 from robotbrain.pipeline.geometry import Pose, PoseBuffer, wrap
+from robotbrain.ros import charge_work
 from robotbrain.ros.conversions import ns_to_time, scan_to_arrays, time_to_ns, yaw_to_quaternion
 
 STILL_RATE = 0.01
@@ -61,6 +62,7 @@ class EstimatorNode(Node):
             self._publish(stamp, travel / dt if dt > 0 else 0.0)
         self._wheels = (stamp, left, right)
         self._history.add(stamp, self._filter.pose)
+        charge_work("wheel_update", 1)
 
     def _on_scan(self, msg: LaserScan) -> None:
         stamp = time_to_ns(msg.header.stamp)
@@ -75,6 +77,7 @@ class EstimatorNode(Node):
         if match is not None:
             innovation = np.subtract(match.pose, guess)
             self._filter.observe_pose(innovation, match.covariance)
+        charge_work("scan_match", self._matcher.queries)
         after = self._filter.pose
         corrected: Pose = (
             guess[0] + after[0] - before[0],
@@ -83,7 +86,8 @@ class EstimatorNode(Node):
         )
         # A keyframe taken while turning fast would be smeared by its own time stamp.
         if abs(self._last_rate - self._filter.bias) < 0.4:
-            self._matcher.keep(points, corrected)
+            kept = self._matcher.keep(points, corrected)
+            charge_work("keyframe", self._matcher.point_count if kept else 0)
 
     def _publish(self, stamp: int, speed: float) -> None:
         x, y, yaw = self._filter.pose

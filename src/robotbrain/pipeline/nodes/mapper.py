@@ -8,11 +8,13 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import LaserScan, PointCloud2
 
+from robotbrain.pipeline.geometry import Pose
 from robotbrain.pipeline.grid import GridFrame
 from robotbrain.pipeline.mapping import OccupancyMapper
 from robotbrain.pipeline.nodes.grids import grid_to_msg
 from robotbrain.pipeline.nodes.perception import FLOOR_LABEL
 from robotbrain.pipeline.nodes.poses import StampedPoses
+from robotbrain.ros import charge_work
 from robotbrain.ros.conversions import cloud_to_points, scan_to_arrays, time_to_ns
 
 MAP_HALF_EXTENT, MAP_RESOLUTION = 11.0, 0.05
@@ -36,18 +38,27 @@ class MapperNode(Node):
 
     def _on_scan(self, msg: LaserScan) -> None:
         ranges, angles = scan_to_arrays(msg)
-        self._poses.when_known(time_to_ns(msg.header.stamp), lambda pose: self._mapper.add_scan(pose, ranges, angles))
+
+        def add(pose: Pose) -> None:
+            self._mapper.add_scan(pose, ranges, angles)
+            charge_work("map_scan", self._mapper.written)
+
+        self._poses.when_known(time_to_ns(msg.header.stamp), add)
 
     def _on_points(self, msg: PointCloud2) -> None:
         points = cloud_to_points(msg).astype(np.float64)
         floor = points[:, 2] == FLOOR_LABEL
-        self._poses.when_known(
-            time_to_ns(msg.header.stamp),
-            lambda pose: self._mapper.add_points(pose, points[floor, :2], points[~floor, :2]),
-        )
+
+        def add(pose: Pose) -> None:
+            self._mapper.add_points(pose, points[floor, :2], points[~floor, :2])
+            charge_work("map_points", self._mapper.written)
+
+        self._poses.when_known(time_to_ns(msg.header.stamp), add)
 
     def _publish(self) -> None:
         if self._poses.latest() is None:
             return
-        now = self.get_clock().now().to_msg()
-        self._publisher.publish(grid_to_msg(self._mapper.occupancy(), self._mapper.frame, now))
+        occupancy = self._mapper.occupancy()
+        msg = grid_to_msg(occupancy, self._mapper.frame, self.get_clock().now().to_msg())
+        charge_work("map_render", occupancy.size)
+        self._publisher.publish(msg)

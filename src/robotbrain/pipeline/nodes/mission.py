@@ -16,6 +16,7 @@ from robotbrain.pipeline.exploration import MarkerTracker, ViewMemory
 from robotbrain.pipeline.geometry import Pose, transform
 from robotbrain.pipeline.nodes.grids import grid_from_msg
 from robotbrain.pipeline.nodes.poses import StampedPoses, check_finite
+from robotbrain.ros import charge_work
 from robotbrain.ros.conversions import numpy_to_path, time_to_ns, yaw_to_quaternion
 
 RATE_HZ = 4.0
@@ -68,6 +69,7 @@ class MissionNode(Node):
             self._views = ViewMemory(frame)
         elif self._views.frame != frame:
             self._views = self._views.moved_to(frame)
+        charge_work("map_read", self._occupancy.size)
 
     def _on_marker(self, msg: PointStamped) -> None:
         seen = np.array([msg.point.x, msg.point.y])
@@ -84,6 +86,7 @@ class MissionNode(Node):
             return
         now = self.get_clock().now().nanoseconds * 1e-9
         self._views.look(pose, self._occupancy)
+        charge_work("view", self._views.looked)
         goal = self._marker.estimate()
         if goal is not None:
             self._target = None
@@ -112,6 +115,7 @@ class MissionNode(Node):
                 self._target = None
         if self._target is None:
             self._target = self._views.next_target(pose, self._occupancy)
+            charge_work("explore", self._views.searched)
             self._target_since = now
         if self._target is None:
             # All that can be reached was viewed, and there was no marker: it must have been overlooked.

@@ -18,7 +18,7 @@ from robotbrain.pipeline.segmentation import (
     locate_marker,
     preprocess,
 )
-from robotbrain.ros import charge
+from robotbrain.ros import charge, charge_work
 from robotbrain.ros.conversions import image_to_numpy, numpy_to_image, points_to_cloud
 
 FLOOR_LABEL, OBSTACLE_LABEL = 0.0, 1.0
@@ -62,24 +62,32 @@ class PerceptionNode(Node):
             return
         mask = self.segment(image_to_numpy(msg))
         points = back_project(image_to_numpy(self._depth), self._camera)
+        charge_work("back_project", mask.size)
         self._publish(msg, mask, points)
 
     def segment(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return the (H, W) class ids of an (H, W, 3) image."""
-        logits = self._engine.infer(preprocess(image))
-        charge(self._engine.latency_ns)
-        return decode(logits)
+        batch = preprocess(image)
+        charge_work("preprocess", image.shape[0] * image.shape[1])
+        logits = self._engine.infer(batch)
+        charge(self._engine.latency_ns, self._engine.resource)
+        mask = decode(logits)
+        charge_work("decode", mask.size)
+        return mask
 
     def _publish(self, msg: Image, mask: NDArray[np.uint8], points: NDArray[np.float64]) -> None:
-        self._mask_pub.publish(numpy_to_image(mask, "mono8", stamp=msg.header.stamp, frame_id=msg.header.frame_id))
+        mask_image = numpy_to_image(mask, "mono8", stamp=msg.header.stamp, frame_id=msg.header.frame_id)
         floor, obstacles = ground_points(mask, points)
+        marker = locate_marker(mask, points)
         labelled = np.zeros((len(floor) + len(obstacles), 3), dtype=np.float32)
         labelled[: len(floor), :2] = floor
         labelled[len(floor) :, :2] = obstacles
         labelled[: len(floor), 2] = FLOOR_LABEL
         labelled[len(floor) :, 2] = OBSTACLE_LABEL
-        self._points_pub.publish(points_to_cloud(labelled, stamp=msg.header.stamp, frame_id="base_link"))
-        marker = locate_marker(mask, points)
+        cloud = points_to_cloud(labelled, stamp=msg.header.stamp, frame_id="base_link")
+        charge_work("label_points", mask.size)
+        self._mask_pub.publish(mask_image)
+        self._points_pub.publish(cloud)
         if marker is not None:
             out = PointStamped()
             out.header.stamp = msg.header.stamp

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.srv import GetPlan
 from rclpy.node import Node
@@ -11,7 +9,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from robotbrain.pipeline.nodes.grids import grid_from_msg
 from robotbrain.pipeline.planning import InflationParams, plan_path
-from robotbrain.ros import charge
+from robotbrain.ros import charge_work
 from robotbrain.ros.conversions import numpy_to_path
 
 
@@ -20,13 +18,11 @@ class PlannerNode(Node):
 
     Args:
         params: inflation; defaults suit the kit's robot.
-        planning_ns: simulated CPU time of a plan by cells expanded; None means it takes none.
     """
 
-    def __init__(self, params: InflationParams | None = None, planning_ns: Callable[[int], int] | None = None) -> None:
+    def __init__(self, params: InflationParams | None = None) -> None:
         super().__init__("planner")
         self._params = params
-        self._planning_ns = planning_ns
         self._map: OccupancyGrid | None = None
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.create_subscription(OccupancyGrid, "map", self._on_map, latched)
@@ -39,6 +35,7 @@ class PlannerNode(Node):
         if self._map is None:
             return response
         occupancy, frame = grid_from_msg(self._map)
+        charge_work("map_read", occupancy.size)
         start, goal = request.start.pose.position, request.goal.pose.position
         result = plan_path(
             occupancy,
@@ -48,8 +45,9 @@ class PlannerNode(Node):
             tolerance=float(request.tolerance),
             params=self._params,
         )
-        if self._planning_ns is not None:
-            charge(self._planning_ns(result.expanded))
+        charge_work("costmap", result.cells)
+        charge_work("astar", result.expanded)
+        charge_work("smooth", result.path_cells)
         if result.points is not None:
             response.plan = numpy_to_path(result.points, stamp=self.get_clock().now().to_msg())
         return response

@@ -10,6 +10,7 @@ from nav_msgs.msg import Odometry
 
 from robotbrain.errors import InputError
 from robotbrain.pipeline.geometry import Pose, PoseBuffer
+from robotbrain.ros import charge_work
 from robotbrain.ros.conversions import pose_to_xy_yaw, time_to_ns
 
 
@@ -40,6 +41,7 @@ class StampedPoses:
         pose = pose_to_xy_yaw(msg.pose.pose)
         check_finite("odometry/filtered", pose)
         self._poses.add(time_to_ns(msg.header.stamp), pose)
+        charge_work("pose", 1)
         self._flush()
 
     def latest(self) -> Pose | None:
