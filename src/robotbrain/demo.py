@@ -201,11 +201,11 @@ def _device_table(devices: Sequence[DeviceSummary]) -> str:
         "<th scope=col>network (ms)</th><th scope=col>control rate (Hz)</th><th scope=col>end to end, median (ms)</th>"
         "<th scope=col>99th percentile (ms)</th><th scope=col>worlds solved</th><th scope=col>module (W)</th>"
         f"<th scope=col>energy (J/m)</th></tr></thead><tbody>{rows}</tbody></table></div>"
-        "<p>What the robot sees is the same everywhere; what its work takes is not. It is charged for a 640 x 480 camera"
-        " and a network of ResNet-50's size. <em>One thread</em>: all nodes under one <code>rclpy.spin</code>, so"
-        " that each inference holds up the controller. <em>Node by node</em>: a process for each node. Latencies and power"
-        " are predicted (<code>robotbrain jetson show</code> gives their origin); CPU times are those of Python nodes,"
-        " scaled by a published single-thread benchmark.</p>"
+        "<p>What the robot sees is the same everywhere; what its work takes is not. It is charged for a 640 x 480"
+        " camera and a network of ResNet-50's size. <em>One thread</em>: all nodes under one <code>rclpy.spin</code>,"
+        " so that each inference holds up the controller. <em>Node by node</em>: a process for each node. Latencies"
+        " and power are predicted (<code>robotbrain jetson show</code> gives their origin); CPU times are those of"
+        " Python nodes, scaled by a published single-thread benchmark.</p>"
     )
 
 

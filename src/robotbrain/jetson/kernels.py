@@ -45,7 +45,7 @@ class Kernel:
     dla_reason: str = "unknown"
 
     def __post_init__(self) -> None:
-        kind = self.op.partition(":")[0]
+        kind = self.op.partition(":")[0] if isinstance(self.op, str) else ""
         if kind not in COMPUTE_OPS + MEMORY_OPS:
             raise InputError(
                 f"kernel {self.name or self.op!r}: op",

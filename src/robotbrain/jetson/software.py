@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 from robotbrain.errors import InputError
 from robotbrain.jetson.catalogue import Module, list_modules, load_module
@@ -97,7 +99,13 @@ def load_jetpacks() -> tuple[JetPack, ...]:
     Raises:
         InputError: for a table that does not hold what it must.
     """
-    root = read_table(find_part("jetpack.toml"))
+    path = find_part("jetpack.toml")
+    return _load_jetpacks(path, path.stat().st_mtime_ns)
+
+
+@functools.lru_cache(maxsize=8)
+def _load_jetpacks(path: Path, _changed: int) -> tuple[JetPack, ...]:
+    root = read_table(path)
     root.only(("sources", "releases"))
     known = list_modules()
     parts = ("l4t", "cuda", "tensorrt", "ubuntu", "python")

@@ -57,6 +57,7 @@ COMPONENTS = (
         (
             ("family", 0.3),
             ("family+precision", 0.2),
+            ("engine", 0.4),
             ("harness", 0.2),
             ("family+harness", 0.2),
             ("harness+module+precision", 0.1),
@@ -68,14 +69,14 @@ COMPONENTS = (
         "depthwise",
         math.log(0.3),
         0.6,
-        (("family", 0.7), ("harness", 0.7), ("family+harness", 1.5), ("family+precision", 0.3)),
+        (("family", 0.7), ("engine", 0.7), ("harness", 0.7), ("family+harness", 1.5), ("family+precision", 0.3)),
         "share of the CUDA cores' peak that depthwise convolutions reach (they do not use tensor cores)",
     ),
     Component(
         "memory",
         math.log(0.6),
         0.3,
-        (("family", 0.2), ("family+harness", 0.2), ("family+precision", 0.15)),
+        (("family", 0.2), ("engine", 0.3), ("family+harness", 0.2), ("family+precision", 0.15)),
         "share of the bandwidth that is reached",
     ),
     Component("matmul", 0.0, 0.3, (("family", 0.3),), "gain in bandwidth of matrix products, which stream weights"),
@@ -85,6 +86,7 @@ COMPONENTS = (
         1.5,
         (
             ("family", 0.5),
+            ("engine", 0.7),
             ("harness", 0.7),
             ("family+harness", 0.5),
             ("harness+module", 0.15),
@@ -97,7 +99,7 @@ COMPONENTS = (
         "fixed",
         math.log(0.1),
         1.2,
-        (("family", 0.5), ("harness", 0.7), ("family+harness", 0.5), ("harness+module", 0.3)),
+        (("family", 0.5), ("engine", 0.7), ("harness", 0.7), ("family+harness", 0.5), ("harness+module", 0.3)),
         "fixed cost of an inference, ms",
     ),
 )

@@ -62,7 +62,8 @@ class PowerFit:
     """Fitted coefficients, as logarithms.
 
     Attributes:
-        values: by name: ``clock``, ``arithmetic``, ``memory``, ``family=...`` (on the first two), ``rest=<module>``.
+        values: by name: ``clock``, ``arithmetic``, ``memory``, ``family=...`` (on the first two), ``rest=<module>``,
+            ``rest family=...`` (mean deviation of that from what the catalogue assumes).
         median_error: relative, leave-one-out; NaN if not computed.
     """
 
@@ -84,7 +85,9 @@ class PowerFit:
         clock = math.exp(self.values["clock"]) * dynamic
         arithmetic = math.exp(self.values["arithmetic"]) * dynamic * min(max(use, 0.0), 1.0)
         memory = math.exp(self.values["memory"]) * mode.emc_mhz / 1000 * module.memory_bus_bits / 8
-        rest = math.exp(get(f"rest={module.slug}", math.log(_rest_prior(module))))
+        # A module without rows is as far from what the catalogue assumes as its family's are.
+        unseen = math.log(_rest_prior(module)) + get(f"rest family={module.family}", 0.0)
+        rest = math.exp(get(f"rest={module.slug}", unseen))
         # At rest the clocks of GPU and memory are gated: half of the memory's power stays, a tenth of the clock tree's.
         return rest + busy * (clock + arithmetic + memory) + (1 - busy) * (0.1 * clock + 0.5 * memory)
 
@@ -148,7 +151,18 @@ def fit_power(rows: Sequence[PowerRow]) -> PowerFit:
         return np.array([*robust, *((values - prior) / spread)])
 
     solution = least_squares(residuals, prior, xtol=1e-10, ftol=1e-10)
-    return PowerFit(dict(zip(names, (float(v) for v in solution.x), strict=True)))
+    values = dict(zip(names, (float(v) for v in solution.x), strict=True))
+    for family in families:
+        values[f"rest family={family}"] = float(
+            np.mean(
+                [
+                    values[f"rest={slug}"] - math.log(_rest_prior(module))
+                    for slug, module in modules.items()
+                    if module.family == family
+                ]
+            )
+        )
+    return PowerFit(values)
 
 
 def power_errors(rows: Sequence[PowerRow]) -> list[tuple[PowerRow, float]]:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robotbrain.errors import InputError
-from robotbrain.jetson.catalogue import Module
+from robotbrain.jetson.catalogue import Module, list_modules, load_module
 from robotbrain.jetson.figures import Figure, read_table
 from robotbrain.jetson.kernels import KernelGraph
 from robotbrain.jetson.paths import find_part
@@ -141,6 +141,13 @@ class ThermalModel:
         return goal + (temperature_c - goal) * math.exp(-seconds / self.time_constant_s)
 
 
+def _cooled_for_w(module: Module) -> float:
+    """Return the power that the developer kit's heat sink is made for: the Super variants are the same hardware."""
+    base = module.slug.removesuffix("-super")
+    twins = [load_module(slug) for slug in (base, f"{base}-super") if slug in list_modules()]
+    return max(twin.max_power_w for twin in [module, *twins])
+
+
 def thermal_model(module: Module, cooling: Cooling = "fan", ambient_c: float | None = None) -> ThermalModel:
     """Return the thermal model of a module on its developer kit.
 
@@ -158,7 +165,7 @@ def thermal_model(module: Module, cooling: Cooling = "fan", ambient_c: float | N
     ambient = figures["thermal.ambient_c"].value if ambient_c is None else float(ambient_c)
     if not -40 <= ambient <= 80:
         raise InputError("ambient_c", given=ambient_c, expected="-40 to 80 degC", fix="Give degrees Celsius.")
-    resistance = figures["thermal.full_load_rise_c"].value / module.max_power_w
+    resistance = figures["thermal.full_load_rise_c"].value / _cooled_for_w(module)
     if cooling == "passive":
         resistance *= figures["thermal.passive_ratio"].value
     return ThermalModel(
