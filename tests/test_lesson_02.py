@@ -54,10 +54,12 @@ assert spread > 1.8
 misses = [p.latency_high_ms < r.latency_ms for p, r, ok in zip(said, outside, inside) if not ok]
 assert len(said) == 10 and len(misses) >= 3 and all(misses)  # wherever it is wrong, it is too fast
 energy = {(p.device, p.mode): p.energy_mj for p in candidates}
-thrifty = [("orin-nano-8gb", "7W"), ("agx-orin-64gb", "MODE_15W")]
-assert max(e for k, e in energy.items() if k not in thrifty) < min(energy[k] for k in thrifty)
+for device, slow in (("orin-nano-8gb", "7W"), ("orin-nano-8gb-super", "15W"), ("agx-orin-64gb", "MODE_15W")):
+    assert energy[device, slow] == max(e for (d, _), e in energy.items() if d == device)  # thrifty modes cost most
 best = min(candidates, key=lambda p: p.energy_mj)
-assert best.device == "agx-orin-64gb" and average_w(best) > min(map(average_w, candidates)) + 1
+large = next(p for p in candidates if (p.device, p.mode) == ("agx-orin-64gb", "MAXN"))
+assert large.energy_mj < 1.15 * best.energy_mj  # level for an image
+assert average_w(large) > min(map(average_w, candidates)) + 1  # and dearer by the hour
 assert traces["fan"].throttled_s == 0 and traces["passive"].throttled_s > 300
 assert not traces["passive"].shut_down
 """
@@ -233,7 +235,7 @@ def qualified(every: list[Prediction]) -> list[Prediction]:
         (
             p
             for p in every
-            if p.latency_high_ms <= 1000 / 30 and p.power_w <= 10 and float(p.module.jetpacks[-1][0]) >= 6 and p.fits
+            if p.latency_high_ms <= 1000 / 30 and p.power_w <= 5 and float(p.module.jetpacks[-1][0]) >= 6 and p.fits
         ),
         key=lambda p: p.energy_mj,
     )
@@ -357,7 +359,7 @@ def test_the_choice_is_refused_for_the_requirement_it_misses(qualified: list[Pre
     reasons = {
         ("nano-4gb", "MAXN"): ["may take", "newest JetPack is 4.6"],
         ("xavier-nx", "MODE_10W_4CORE"): ["newest JetPack is 5.1"],
-        ("agx-orin-64gb", "MAXN"): ["the budget is 10 W"],
+        ("agx-orin-64gb", "MAXN"): ["the budget is 5 W"],
     }
     for (device, mode), words in reasons.items():
         report = check("choice", choice={"device": device, "mode": mode})

@@ -283,7 +283,7 @@ def test_slopes_of_kernels_that_do_nothing_are_finite() -> None:
 
 
 def test_effects_are_summed_by_their_keys_and_unknown_ones_are_zero() -> None:
-    here, there = BOARD, replace(BOARD, family="g", harness="i", module="n")
+    here, there = BOARD, replace(BOARD, family="g", harness="mlperf", module="n")
     effects = list_effects([here])
     matrices = design(effects, [here, there])
     for component in COMPONENTS:

@@ -195,8 +195,11 @@ def test_a_fan_cools_better_and_warm_air_worse(slug: str) -> None:
     watts = module.max_power_w
     assert fan.steady_c(watts) < passive.steady_c(watts)
     assert desert.steady_c(watts) == pytest.approx(fan.steady_c(watts) + 20)
-    # The maker's heat sink keeps the module out of throttling at its highest power; without the fan it does not.
-    assert fan.steady_c(watts) < fan.throttle_c < passive.steady_c(watts)
+    # The maker's heat sink keeps the module out of throttling at its highest power; without the fan it does not, if
+    # that is the highest power of this hardware (a Super variant is the same hardware in faster modes).
+    assert fan.steady_c(watts) < fan.throttle_c
+    if f"{slug}-super" not in list_modules():
+        assert fan.throttle_c < passive.steady_c(watts)
     assert fan.throttle_c < fan.shutdown_c
 
 

@@ -153,15 +153,13 @@ def fit_power(rows: Sequence[PowerRow]) -> PowerFit:
     solution = least_squares(residuals, prior, xtol=1e-10, ftol=1e-10)
     values = dict(zip(names, (float(v) for v in solution.x), strict=True))
     for family in families:
-        values[f"rest family={family}"] = float(
-            np.mean(
-                [
-                    values[f"rest={slug}"] - math.log(_rest_prior(module))
-                    for slug, module in modules.items()
-                    if module.family == family
-                ]
-            )
-        )
+        deviations = [
+            values[f"rest={slug}"] - math.log(_rest_prior(module))
+            for slug, module in modules.items()
+            if module.family == family
+        ]
+        # Shrunk towards none, as if one more module had been just as assumed.
+        values[f"rest family={family}"] = sum(deviations) / (len(deviations) + 1)
     return PowerFit(values)
 
 
