@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint format lab labs train bench proof-drive mutation-test clean
+.PHONY: help install demo test lint format lab labs train bench profiles proof-drive proof-devices mutation-test clean
 
 help:  ## Show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-15s %s\n", $$1, $$2}'
@@ -48,12 +48,21 @@ train: $(STAMP)  ## Train the perception network again (a few minutes) and repor
 proof-drive: $(STAMP)  ## Drive 100 unseen worlds (about ten minutes)
 	$(BIN)/python benchmarks/drive_success.py
 
+proof-devices: $(STAMP)  ## Drive the same 20 worlds on five Jetsons (about ten minutes)
+	$(BIN)/python benchmarks/devices.py
+
+profiles: $(STAMP)  ## Calibrate the Jetson twin and write the reference profiles again
+	$(BIN)/robotbrain jetson calibrate
+	$(BIN)/robotbrain jetson reference
+
 mutation-test: $(STAMP)  ## Test the tests of the lab with named wrong solutions
 	$(BIN)/robotbrain mutation-test lab_integration --jobs 2
 
 bench: $(STAMP)  ## Run the benchmarks; each prints one table
 	$(BIN)/python benchmarks/ros_rate.py
 	$(BIN)/python benchmarks/sim_rate.py
+	$(BIN)/python benchmarks/twin_accuracy.py
+	$(BIN)/python benchmarks/cpu_work.py
 
 clean:  ## Remove .venv, caches and generated pages
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache demo build dist
