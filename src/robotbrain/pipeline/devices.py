@@ -197,7 +197,7 @@ def plot_devices(summaries: Sequence[DeviceSummary]) -> tuple[Figure, str]:
     left.barh(rows, [s.e2e_p99_ms for s in summaries], color="#0072B2", label="99th percentile")
     left.barh(rows, [s.e2e_p50_ms for s in summaries], height=0.35, color="#E69F00", label="median")
     left.set(yticks=rows, yticklabels=names, xlabel="sensor to command (ms, simulated)")
-    left.legend(loc="lower right")
+    left.legend(loc="center right")
     right.barh(rows, [100 * s.success_rate for s in summaries], color="#009E73")
     right.set(xlim=(0, 119), xticks=range(0, 101, 25), xlabel="worlds solved (%)")
     for row, s in zip(rows, summaries, strict=True):

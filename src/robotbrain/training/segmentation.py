@@ -171,7 +171,10 @@ def train(config: TrainConfig, output: Path, *, progress: bool = True) -> dict[s
 
 
 def export(network: nn.Module, output: Path) -> None:
-    """Write the network as ONNX, opset 17, batch axis dynamic, batch norm folded into the convolutions."""
+    """Write the network as ONNX, batch axis dynamic, batch norm folded into the convolutions.
+
+    Opset 13 is the newest that TensorRT 8.2 parses, with which JetPack ends on the Nano.
+    """
     import copy
 
     import torch
@@ -184,7 +187,7 @@ def export(network: nn.Module, output: Path) -> None:
             (example,),
             str(temporary),
             dynamo=False,
-            opset_version=17,
+            opset_version=13,
             input_names=["image"],
             output_names=["logits"],
             dynamic_axes={"image": {0: "batch"}, "logits": {0: "batch"}},
