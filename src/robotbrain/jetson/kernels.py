@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -16,6 +17,18 @@ MEMORY_OPS = ("pw", "mem")
 
 PRECISIONS = ("fp32", "fp16", "int8")
 """Precisions a kernel can run in."""
+
+
+def _plain(number: Any) -> Any:
+    """Return a whole number of any kind (NumPy's, 5e6) as an int; leave anything else for the check to name."""
+    if isinstance(number, bool):
+        return number
+    if isinstance(number, float) and number.is_integer():
+        return int(number)
+    try:
+        return operator.index(number)
+    except TypeError:
+        return number
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +162,9 @@ class KernelGraph:
         made: list[Kernel] = []
         for index, item in enumerate(kernels):
             try:
-                fields = {key: item[key] for key in ("op", "macs", "in_elems", "out_elems", "weight_elems")}
+                fields: dict[str, Any] = {"op": item["op"]}
+                for key in ("macs", "in_elems", "out_elems", "weight_elems"):
+                    fields[key] = _plain(item[key])
             except (KeyError, TypeError) as error:
                 raise InputError(
                     f"kernel {index} of {name}",

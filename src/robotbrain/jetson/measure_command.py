@@ -26,9 +26,13 @@ CURRENT = "current"
 def measure_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``robotbrain jetson measure``."""
     parser.add_argument("model", type=Path, metavar="MODEL.onnx", help="the network")
-    parser.add_argument("--precision", choices=PRECISIONS, help="default: fp16 on a board, what a log says with logs")
+    parser.add_argument(
+        "--precision", type=str.lower, choices=PRECISIONS, help="default: fp16 on a board, what a log says with logs"
+    )
     parser.add_argument("--mode", default=CURRENT, help="power mode; on a board it must be the one that is set")
-    parser.add_argument("--device", metavar="SLUG", help="module; found out on a board, required with --from-logs")
+    parser.add_argument(
+        "--device", type=str.lower, metavar="SLUG", help="module; found out on a board, required with --from-logs"
+    )
     parser.add_argument(
         "--shape", action="append", default=[], metavar="NAME:1x3x224x224", help="shape of an input with dynamic axes"
     )

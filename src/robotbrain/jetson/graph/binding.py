@@ -66,7 +66,7 @@ def bind_inputs(
             "dynamic axes",
             given="no length for " + ", ".join(missing),
             expected="a length for each",
-            fix=f"Pass bindings, e.g. bindings={{{example!r}: 224}}; 'input:axis' works as a key too.",
+            fix=f"Pass bindings={{{example!r}: 224}}, or --bind {example}=224; 'input:axis' works as a key too.",
         )
     if unknown := sorted(set(lengths) - known):
         raise InputError(

@@ -80,6 +80,8 @@ def _read(path: Path) -> bytes:
             _check_size(path.stat().st_size, str(path))
             return path.read_bytes()
         given = f"{path} (a directory)" if path.is_dir() else f"{path} (no such file)"
+    except InputError:
+        raise
     except (OSError, ValueError) as error:
         given, fix = str(path), f"The system says: {error}"
     raise InputError("model", given=given, expected="the path of an ONNX file", fix=fix)

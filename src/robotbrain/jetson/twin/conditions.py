@@ -24,6 +24,10 @@ BYTES = {"fp32": 4.0, "fp16": 2.0, "int8": 1.0}
 """Bytes of an element by precision."""
 
 
+RELATIVES = {"blackwell": "ampere"}
+"""Families without a published measurement, and the measured one whose behaviour stands in for theirs: the newest."""
+
+
 def check_choice(what: str, given: object, choices: tuple[str, ...]) -> str:
     """Return ``given`` in lower case if it is one of the choices.
 
@@ -72,7 +76,7 @@ class Conditions:
     def levels(self) -> dict[str, str]:
         """Return the values of the attributes that effects of the model depend on."""
         return {
-            "family": self.family,
+            "family": RELATIVES.get(self.family, self.family),
             "precision": self.precision,
             # MLPerf's engines are fused by hand and run as CUDA graphs: no model of what anybody else's do.
             "engine": "tuned" if self.harness == "mlperf" else "plain",

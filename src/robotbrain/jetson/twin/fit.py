@@ -8,13 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robotbrain.jetson.twin.conditions import Conditions
+from robotbrain.jetson.twin.conditions import RELATIVES, Conditions
 from robotbrain.jetson.twin.latency import NAMES, Batch, Effect, Work, design, list_effects, unseen_variance
 
 Array = NDArray[np.float64]
 
 NOISE = 0.06
 """Spread of published latencies around any model, as a log error: between harness runs of one network, about 5 %."""
+
+KINSHIP = 0.4
+"""Spread of the log error where another GPU family stands in (assumed: as between measured families left out)."""
 
 _ROBUST = 1.5
 """Beyond this many NOISE, a residual counts linearly (pseudo-Huber)."""
@@ -66,6 +69,8 @@ class Fitted:
         slopes = batch.log_slopes(theta)
         gradient = sum(slopes[name][0] * matrices[name][0] for name in NAMES)
         variance = float(gradient @ self.covariance @ gradient) + NOISE**2
+        if where.family in RELATIVES:
+            variance += KINSHIP**2
         for name, unseen in unseen_variance(self.effects, where).items():
             variance += float(slopes[name][0]) ** 2 * unseen
         return float(np.sqrt(variance))

@@ -19,7 +19,7 @@ from robotbrain.jetson.modes import PowerMode
 from robotbrain.jetson.module import Module
 from robotbrain.jetson.software import compatible
 from robotbrain.jetson.twin.calibrate import Calibration, load_calibration
-from robotbrain.jetson.twin.conditions import PRECISIONS, Conditions, check_choice, conditions
+from robotbrain.jetson.twin.conditions import PRECISIONS, RELATIVES, Conditions, check_choice, conditions
 from robotbrain.jetson.twin.latency import Batch, Work, explicit_precision, kernel_precisions, make_work
 from robotbrain.jetson.twin.power import wall_from_module_w
 from robotbrain.jetson.twin.prediction import KernelTime, Prediction
@@ -53,7 +53,10 @@ def as_graph(model: Any, bindings: Mapping[str, int] | None = None) -> KernelGra
         return analyse(model, bindings=bindings)
     if isinstance(model, str | Path) and Path(model).is_file():
         path = Path(model).resolve()
-        digest = hashlib.sha256(path.read_bytes()).hexdigest()
+        if path.stat().st_size > 2**31:
+            return analyse(path, bindings=bindings)  # which refuses it in good order
+        with path.open("rb") as file:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
         return _analysed(path, digest, key)
     return analyse(model, bindings=bindings)
 
@@ -158,7 +161,7 @@ def predict(
 
 def compare(
     model: Any,
-    devices: Sequence[str] | None = None,
+    devices: Sequence[str | Module] | None = None,
     *,
     precision: str = "fp16",
     harness: str = "trtexec",
@@ -180,10 +183,11 @@ def compare(
     from robotbrain.jetson.twin.data import fastest_mode
 
     modes = check_choice("modes", modes, ("default", "fastest", "all"))
+    chosen_devices = [devices] if isinstance(devices, str | Module) else devices
     graph = as_graph(model, bindings)
     predictions = []
-    for slug in list_modules() if devices is None else devices:
-        module = load_module(slug)
+    for device in list_modules() if chosen_devices is None else chosen_devices:
+        module = device if isinstance(device, Module) else load_module(device)
         chosen = {
             "default": [module.default_mode],
             "fastest": [fastest_mode(module)],
@@ -272,7 +276,10 @@ def _caveats(module: Module, where: Conditions, calibration: Calibration, kernel
     notes = []
     families = {family for family, _, _ in calibration.measured}
     if module.family not in families:
-        notes.append(f"nothing published was measured on a {module.family} GPU: the interval is a guess")
+        notes.append(
+            f"nothing published was measured on a {module.family} GPU: it is taken to behave as "
+            f"{RELATIVES.get(module.family, 'others')} does, and the interval is a guess"
+        )
     elif (module.family, where.precision, where.harness) not in calibration.measured:
         notes.append(
             f"no calibration row of {where.harness} in {where.precision} on a {module.family} GPU: carried over from "
