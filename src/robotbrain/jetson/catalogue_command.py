@@ -110,7 +110,9 @@ def show_main(arguments: argparse.Namespace) -> int:
     print("\nPeaks are dense: two operations for each multiply-accumulate, no structured sparsity.")
     print(f"\nPower modes ({module.default_mode.name} is the default)\n")
     print(_mode_table(module, cite))
-    print("\nAny of them can be named by its number, in either case, without MODE_, or by its beginning: 0, MAXN, 15w.")
+    start = module.default_mode
+    names = f"{start.id}, {start.name}, {start.name.removeprefix('MODE_').lower()}"
+    print(f"\nAny of them can be named by its number, in either case, without MODE_, or by its beginning: {names}.")
     print("\nJetPack releases that support it, oldest first\n")
     print(_jetpack_table(jetpacks, cite))
     if headline is not None:

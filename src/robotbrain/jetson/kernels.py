@@ -15,6 +15,9 @@ COMPUTE_OPS = ("conv", "dw", "mm")
 MEMORY_OPS = ("pw", "mem")
 """Kernels that only move data: pointwise arithmetic (``pw``) and everything else (``mem:pool``, ...)."""
 
+MAX_BATCH = 65536
+"""Largest batch; beyond it a number is a slip of the pen."""
+
 PRECISIONS = ("fp32", "fp16", "int8")
 """Precisions a kernel can run in."""
 
@@ -138,11 +141,14 @@ class KernelGraph:
         """Return the graph for ``batch`` times as many inputs.
 
         Raises:
-            InputError: unless ``batch`` is a whole number of at least 1.
+            InputError: unless ``batch`` is a whole number from 1 to MAX_BATCH.
         """
-        if isinstance(batch, bool) or not isinstance(batch, int) or batch < 1:
+        if isinstance(batch, bool) or not isinstance(batch, int) or not 1 <= batch <= MAX_BATCH:
             raise InputError(
-                "batch", given=batch, expected="a whole number, 1 or more", fix="1 is one image at a time."
+                "batch",
+                given=batch,
+                expected=f"a whole number, 1 or more (at most {MAX_BATCH})",
+                fix="1 is one image at a time.",
             )
         if batch == 1:
             return self
