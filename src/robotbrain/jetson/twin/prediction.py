@@ -180,7 +180,10 @@ class Prediction:
             for what, value in self.rows()
         )
         notes = "".join(f"<li>{html.escape(text)}</li>" for text in self.warnings)
-        return f"<table>{body}</table>" + (f"<ul>{notes}</ul>" if notes else "")
+        from robotbrain.jetson.plots import plot_prediction, to_html
+
+        figure = f"<details><summary>Roofline and timeline</summary>{to_html(plot_prediction(self))}</details>"
+        return f"<table>{body}</table>" + (f"<ul>{notes}</ul>" if notes else "") + figure
 
 
 def _short(value: float) -> str:

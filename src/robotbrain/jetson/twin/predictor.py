@@ -277,12 +277,12 @@ def _caveats(module: Module, where: Conditions, calibration: Calibration, kernel
     families = {family for family, _, _ in calibration.measured}
     if module.family not in families:
         notes.append(
-            f"nothing published was measured on a {module.family} GPU: it is taken to behave as "
+            f"nothing published was measured on GPUs of the {module.family} family: it is taken to behave as "
             f"{RELATIVES.get(module.family, 'others')} does, and the interval is a guess"
         )
     elif (module.family, where.precision, where.harness) not in calibration.measured:
         notes.append(
-            f"no calibration row of {where.harness} in {where.precision} on a {module.family} GPU: carried over from "
+            f"no calibration row of {where.harness} in {where.precision} on GPUs of the {module.family} family: carried over from "
             "others, hence the wide interval"
         )
     total = sum(kernel.total_ms for kernel in kernels)
