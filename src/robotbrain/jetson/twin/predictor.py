@@ -282,8 +282,8 @@ def _caveats(module: Module, where: Conditions, calibration: Calibration, kernel
         )
     elif (module.family, where.precision, where.harness) not in calibration.measured:
         notes.append(
-            f"no calibration row of {where.harness} in {where.precision} on GPUs of the {module.family} family: carried over from "
-            "others, hence the wide interval"
+            f"no calibration row of {where.harness} in {where.precision} on GPUs of the {module.family} family: "
+            "carried over from others, hence the wide interval"
         )
     total = sum(kernel.total_ms for kernel in kernels)
     products = sum(k.total_ms for k in kernels if k.kernel.op == "mm")
