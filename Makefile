@@ -45,10 +45,10 @@ labs: $(STAMP)  ## Generate labs/ from solutions/
 train: $(STAMP)  ## Train the perception network again (a few minutes) and report its figure
 	$(BIN)/robotbrain train segmentation
 
-proof-drive: $(STAMP)  ## Drive 100 unseen worlds (about ten minutes)
+proof-drive: $(STAMP)  ## Drive 100 unseen worlds (about twenty minutes)
 	$(BIN)/python benchmarks/drive_success.py
 
-proof-devices: $(STAMP)  ## Drive the same 20 worlds on five Jetsons (about ten minutes)
+proof-devices: $(STAMP)  ## Drive the same 20 worlds on five Jetsons (about twenty minutes)
 	$(BIN)/python benchmarks/devices.py
 
 profiles: $(STAMP)  ## Calibrate the Jetson twin and write the reference profiles again
