@@ -45,7 +45,7 @@ labs: $(STAMP)  ## Generate labs/ from solutions/
 train: $(STAMP)  ## Train the perception network again (a few minutes) and report its figure
 	$(BIN)/robotbrain train segmentation
 
-proof-drive: $(STAMP)  ## Drive 100 unseen worlds (about twenty minutes)
+proof-drive: $(STAMP)  ## Drive 100 unseen worlds (about ten minutes)
 	$(BIN)/python benchmarks/drive_success.py
 
 proof-devices: $(STAMP)  ## Drive the same 20 worlds on five Jetsons (about twenty minutes)
