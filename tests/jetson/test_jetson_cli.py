@@ -63,8 +63,6 @@ def jetson(capsys: pytest.CaptureFixture[str]) -> Out:
 
 @pytest.mark.parametrize("name", SUBCOMMANDS)
 def test_every_subcommand_explains_itself(jetson: Out, name: str) -> None:
-    if name == "reference" and not (REPO / "src/robotbrain/jetson/reference.py").exists():
-        pytest.skip("robotbrain.jetson.reference does not exist yet")
     text = jetson(name, "--help")
     assert f"robotbrain jetson {name}" in text
     assert SUBCOMMANDS[name].help in text

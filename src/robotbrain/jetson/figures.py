@@ -227,8 +227,8 @@ class Table:
         return Statement(inner.text("text"), provenance, source, inner.text("note", ""))
 
 
-def read_text(path: Path) -> str:
-    """Return the text of a file.
+def read_text(path: Path, kind: str = "TOML") -> str:
+    """Return the text of a file of some kind, with ``\\n`` line ends.
 
     Raises:
         InputError: if it cannot be read, or is no text.
@@ -237,7 +237,7 @@ def read_text(path: Path) -> str:
         return path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(
-            str(path), given=str(error), expected="a readable TOML file", fix="Restore it from git."
+            str(path), given=str(error), expected=f"a readable {kind} file", fix="Restore it from git."
         ) from error
 
 

@@ -149,6 +149,21 @@ class Module:
             return "fp32"
         return precision
 
+    def highest_flops(self, precision: str) -> float:
+        """Return the dense GPU peak at the highest clock with all SMs on, operations per second (see peak_flops).
+
+        Raises:
+            InputError: for an unknown precision.
+        """
+        tera = {
+            "fp32": self.fp32_tflops,
+            "tf32": self.tf32_tflops,
+            "fp16": self.fp16_tflops,
+            "int8": self.int8_tops,
+        }[self.runs_as(precision)]
+        assert tera is not None
+        return tera * 1e12
+
     def peak_flops(self, precision: str, mode: str | int | PowerMode | None = None) -> float:
         """Return the dense GPU peak in a power mode, operations per second (two for each multiply-accumulate).
 
@@ -159,15 +174,8 @@ class Module:
         Raises:
             InputError: for an unknown precision or mode.
         """
-        tera = {
-            "fp32": self.fp32_tflops,
-            "tf32": self.tf32_tflops,
-            "fp16": self.fp16_tflops,
-            "int8": self.int8_tops,
-        }[self.runs_as(precision)]
-        assert tera is not None
         chosen = self.mode(mode)
-        return tera * 1e12 * (chosen.gpu_mhz / self.gpu_max_mhz) * (chosen.sms_on / self.sm_count)
+        return self.highest_flops(precision) * (chosen.gpu_mhz / self.gpu_max_mhz) * (chosen.sms_on / self.sm_count)
 
     def dla_peak_flops(self, mode: str | int | PowerMode | None = None) -> float:
         """Return the dense INT8 peak of all DLAs in a power mode, operations per second; 0 without a DLA."""

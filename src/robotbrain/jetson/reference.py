@@ -19,6 +19,7 @@ from robotbrain.errors import InputError
 from robotbrain.files import write_text
 from robotbrain.jetson.catalogue import list_modules, load_module
 from robotbrain.jetson.figures import PROVENANCES, Table, read_table
+from robotbrain.jetson.kernels import PRECISIONS as PRECISIONS
 from robotbrain.jetson.paths import find_part, profile_directory
 
 NETWORKS: Mapping[str, tuple[str, str]] = MappingProxyType(
@@ -26,7 +27,6 @@ NETWORKS: Mapping[str, tuple[str, str]] = MappingProxyType(
 )
 """Networks of the labs: the package and the file in it, by name."""
 
-PRECISIONS = ("fp32", "fp16", "int8")
 TOLERANCE = 0.02
 """Relative difference that a test allows by default: far above rounding, far below what a mistake makes."""
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robotbrain.errors import InputError
-from robotbrain.jetson.profiles import JetsonProfile, load_profile
+from robotbrain.jetson.profiles import JetsonProfile, default_network, load_profile
 from robotbrain.pipeline.costs import ProfileCosts
 from robotbrain.pipeline.deployment import Deployment
 from robotbrain.pipeline.watch import Watch
@@ -40,7 +40,7 @@ Parts = Mapping[str, Callable[[], Any]]
 
 def default_model() -> Path:
     """Return the path of the shipped segmentation network."""
-    return Path(__file__).parent / "weights" / "segmentation.onnx"
+    return default_network()
 
 
 @dataclass(frozen=True)

@@ -19,13 +19,13 @@ import numpy as np
 
 from robotbrain.errors import InputError
 from robotbrain.files import write_text
+from robotbrain.jetson.figures import read_text
 from robotbrain.jetson.paths import find_part
 from robotbrain.jetson.twin.data import (
     calibration_directory,
     data_digest,
     load_latency_rows,
     load_power_rows,
-    read_calibration_text,
 )
 from robotbrain.jetson.twin.fit import Fitted, fit
 from robotbrain.jetson.twin.latency import COMPONENTS, Effect
@@ -213,7 +213,7 @@ def parse_calibration(text: str, origin: str) -> Calibration:
 
 @functools.lru_cache(maxsize=4)
 def _load(path: Path, _changed: int) -> Calibration:
-    return parse_calibration(read_calibration_text(path), str(path))
+    return parse_calibration(read_text(path, "text"), str(path))
 
 
 def load_calibration() -> Calibration:

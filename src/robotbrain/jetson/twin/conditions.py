@@ -85,17 +85,6 @@ class Conditions:
         }
 
 
-def _dense_peak(module: Module, precision: str) -> float:
-    tera = {
-        "fp32": module.fp32_tflops,
-        "tf32": module.tf32_tflops,
-        "fp16": module.fp16_tflops,
-        "int8": module.int8_tops,
-    }[module.runs_as(precision)]
-    assert tera is not None
-    return tera * 1e12
-
-
 def conditions(module: Module, mode: PowerMode, precision: str, harness: str) -> Conditions:
     """Return the conditions of an engine on a module in a power mode, or with the clocks of a mode made for it.
 
@@ -106,7 +95,7 @@ def conditions(module: Module, mode: PowerMode, precision: str, harness: str) ->
     harness = check_choice("harness", harness, HARNESSES)
     share = mode.gpu_mhz / module.gpu_max_mhz * mode.sms_on / module.sm_count
     # TensorRT uses TF32 for FP32 layers wherever the tensor cores have it.
-    peak = tuple(_dense_peak(module, "tf32" if p == "fp32" else p) * share for p in PRECISIONS)
+    peak = tuple(module.highest_flops("tf32" if p == "fp32" else p) * share for p in PRECISIONS)
     cuda = module.fp32_tflops * 1e12 * share
     return Conditions(
         module=module.slug,

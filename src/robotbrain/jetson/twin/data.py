@@ -13,7 +13,7 @@ from pathlib import Path
 
 from robotbrain.errors import InputError
 from robotbrain.jetson.catalogue import Module, load_module
-from robotbrain.jetson.figures import SOURCE_FORMS
+from robotbrain.jetson.figures import SOURCE_FORMS, read_text
 from robotbrain.jetson.kernels import KernelGraph
 from robotbrain.jetson.modes import PowerMode
 from robotbrain.jetson.paths import find_part
@@ -91,28 +91,14 @@ def data_digest() -> str:
     """Return a digest of all calibration data, to tell whether a fit is out of date (of text, so not of line ends)."""
     digest = hashlib.sha256()
     for name in ("kernels.json", "latency.csv", "power.csv"):
-        digest.update(read_calibration_text(find_part(f"calibration/{name}")).encode())
+        digest.update(read_text(find_part(f"calibration/{name}"), "text").encode())
     return digest.hexdigest()
-
-
-def read_calibration_text(path: Path) -> str:
-    """Return the text of a file, with ``\\n`` line ends.
-
-    Raises:
-        InputError: if it cannot be read, or is no text.
-    """
-    try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            str(path), given=str(error), expected="a readable text file", fix="Restore it from git."
-        ) from error
 
 
 @functools.lru_cache(maxsize=4)
 def _kernel_lists(path: Path, _changed: int) -> dict[str, KernelGraph]:
     try:
-        data = json.loads(read_calibration_text(path))
+        data = json.loads(read_text(path, "text"))
     except (ValueError, RecursionError) as error:
         if isinstance(error, InputError):
             raise
@@ -186,7 +172,7 @@ class _Row:
 
 def _read(name: str, columns: tuple[str, ...]) -> list[_Row]:
     path = find_part(f"calibration/{name}")
-    reader = csv.DictReader(io.StringIO(read_calibration_text(path)), restkey="", restval=None, strict=True)
+    reader = csv.DictReader(io.StringIO(read_text(path, "text")), restkey="", restval=None, strict=True)
     try:
         rows = [_Row(name, reader.line_num, cells) for cells in reader]
     except csv.Error as error:
