@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import operator
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -21,6 +21,8 @@ from robotbrain.pipeline.watch import Watch
 if TYPE_CHECKING:
     from rclpy.node import Node
 
+    from robotbrain.monitoring.trace import Trace
+    from robotbrain.ros import SimContext
     from robotbrain.sim import RobotSim, World
     from robotbrain.sim.view import Replay
 
@@ -75,6 +77,7 @@ class RunResult:
         box_poses: (T, boxes, 3) x, y, yaw of the movable boxes at the times of ``trajectory``.
         wall_seconds: real time the run took, without setting up.
         world: where it happened.
+        trace: every callback and message, if the run was traced.
     """
 
     seed: int
@@ -101,6 +104,7 @@ class RunResult:
     box_poses: NDArray[np.float64] = field(repr=False)
     wall_seconds: float
     world: World = field(repr=False)
+    trace: Trace | None = field(default=None, repr=False)
 
     @property
     def real_time_factor(self) -> float:
@@ -187,6 +191,8 @@ def drive(
     model: str | Path | None = None,
     time_limit: float = TIME_LIMIT,
     surrogate_seed: int = 0,
+    trace: bool = False,
+    attach: Sequence[Callable[[SimContext], object]] = (),
 ) -> RunResult:
     """Let a brain look for the marker and drive to it, in simulated time.
 
@@ -202,6 +208,8 @@ def drive(
         model: ONNX file of the segmentation network; the shipped one by default.
         time_limit: s.
         surrogate_seed: which surrogate.
+        trace: record every callback and message (some 15 MB a simulated minute).
+        attach: functions that are given the simulation before any node is made: monitors, faults.
 
     Raises:
         InputError: for unknown roles, robots, profiles or power modes.
@@ -231,6 +239,13 @@ def drive(
     context = SimContext(cost_model=costs, resources=device)
     log = DecisionLog(context)
     watch = Watch(context, costs)
+    recorder = None
+    if trace:
+        from robotbrain.monitoring.trace import Recorder
+
+        recorder = Recorder(context, title=f"world {world.spec.seed} on {chosen.slug} in {chosen.power_mode}")
+    for function in attach:
+        function(context)
     with context.as_default():
         from robotbrain.pipeline.nodes.robot import RobotNode
 
@@ -250,6 +265,7 @@ def drive(
             context.try_shutdown()
         wall_seconds = time.perf_counter() - began
         watch.finish(context)
+        recording = None if recorder is None else recorder.trace(roles=costs.roles)
     return RunResult(
         seed=world.spec.seed,
         robot=robot,
@@ -275,6 +291,7 @@ def drive(
         box_poses=np.array(watch.boxes),
         wall_seconds=wall_seconds,
         world=world,
+        trace=recording,
     )
 
 

@@ -110,6 +110,11 @@ class ProfileCosts:
         if foreign:
             self._foreign.add(node_name)
 
+    @property
+    def roles(self) -> dict[str, str]:
+        """Roles by fully qualified node name."""
+        return dict(self._roles)
+
     def role(self, node_name: str) -> str:
         """Return a node's role, empty for none."""
         return self._roles.get(node_name, "")

@@ -14,7 +14,7 @@ from __future__ import annotations
 import os
 
 from robotbrain.ros.api import charge, charge_work
-from robotbrain.ros.context import CallbackRecord, CostModel, SimContext
+from robotbrain.ros.context import CallbackRecord, CostModel, MessageRecord, SimContext
 from robotbrain.ros.exceptions import CallbackError, ReentrancyError, SimulationDeadlockError
 from robotbrain.ros.resources import DeviceResources
 from robotbrain.ros.shim import install as _install
@@ -26,6 +26,7 @@ __all__ = [
     "CallbackRecord",
     "CostModel",
     "DeviceResources",
+    "MessageRecord",
     "ReentrancyError",
     "SimContext",
     "SimulationDeadlockError",

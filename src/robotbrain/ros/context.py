@@ -9,9 +9,9 @@ from __future__ import annotations
 import contextlib
 import heapq
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 from robotbrain.errors import InputError
 from robotbrain.ros.exceptions import CallbackError, NotInitializedException, ReentrancyError
@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 Event = Callable[[Any], None]
 Tap = Callable[[int, str, str, str, bytes], None]
 CallbackTap = Callable[["CallbackRecord"], None]
+MessageTap = Callable[["MessageRecord", bytes], None]
+Filter = Callable[["MessageRecord", bytes], Sequence[tuple[bytes, int]]]
 
 
 class CostModel(Protocol):
@@ -53,6 +55,29 @@ class CostModel(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
+class MessageRecord:
+    """One message on its way: what it is, who sent it, and when it left.
+
+    Attributes:
+        id: counted from 1 in each context, in the order in which messages were given to the middleware.
+        kind: ``topic``, ``request`` or ``response``.
+        name: of the topic or service.
+        type_name: ROS type, e.g. ``sensor_msgs/msg/LaserScan``; for requests and responses that of the service.
+        node: fully qualified name of the sender.
+        released_ns: simulated time at which it left: when the callback that sent it was over.
+        size: bytes of CDR.
+    """
+
+    id: int
+    kind: Literal["topic", "request", "response"]
+    name: str
+    type_name: str
+    node: str
+    released_ns: int
+    size: int
+
+
+@dataclass(frozen=True, slots=True)
 class CallbackRecord:
     """One executed callback, for monitoring: became ready, started and ended at these simulated times (ns).
 
@@ -65,6 +90,11 @@ class CallbackRecord:
         end_ns: when what it published was released, and its worker free again.
         demand_ns: what it cost.
         segments: the cost in order, as (resource, ns).
+        id: counted from 1 in each context, in the order of starting.
+        message: ``id`` of the message that set it off; 0 for a timer.
+        published: ``id`` of every message that it sent, in order.
+        executor: number of its executor, from 0 in the order in which a context's executors were made.
+        worker: which of the executor's threads ran it, from 0.
     """
 
     node: str
@@ -75,6 +105,11 @@ class CallbackRecord:
     end_ns: int
     demand_ns: int = 0
     segments: tuple[Segment, ...] = ()
+    id: int = 0
+    message: int = 0
+    published: tuple[int, ...] = ()
+    executor: int = 0
+    worker: int = 0
 
     @property
     def queued_ns(self) -> int:
@@ -93,8 +128,12 @@ class Execution:
 
     node: Node
     cost_model: CostModel | None = None
+    id: int = 0
+    message: int = 0
+    worker: int = 0
     segments: list[Segment] = field(default_factory=list)
     outbox: list[tuple[Event, Any]] = field(default_factory=list)
+    published: list[int] = field(default_factory=list)
 
     def add(self, resource: str, nanoseconds: int) -> None:
         """Append to the cost; CPU time that follows CPU time is one segment."""
@@ -124,6 +163,8 @@ class SimContext:
         default_executor_factory: makes the executor of a new node. One single-threaded executor per node by
             default, as if every node were a process of its own.
         log_sink: receives every log record; prints by default.
+        slowdown: factor by resource (``cpu``, ``gpu``, …) on the cost of every callback that starts from now on, as of
+            a device that throttles; 1 where a resource is missing.
         horizon_ns: ``rclpy.spin`` stops there, as if Ctrl-C had been pressed; None for no limit.
     """
 
@@ -154,6 +195,12 @@ class SimContext:
         self.nodes: list[Node] = []
         self.taps: list[Tap] = []
         self.callback_taps: list[CallbackTap] = []
+        self.message_taps: list[MessageTap] = []
+        self.filters: list[tuple[str, Filter]] = []
+        self.slowdown: dict[str, float] = {}
+        self.executor_count = 0
+        self.callback_count = 0
+        self.message_count = 0
         self.running: Execution | None = None
         self._heap: list[tuple[int, int, Event, Any]] = []
         self._sequence = 0
@@ -377,6 +424,65 @@ class SimContext:
         """Call ``tap(record)`` for every executed callback; returns a function that removes it."""
         self.callback_taps.append(tap)
         return lambda: self.callback_taps.remove(tap)
+
+    def add_message_tap(self, tap: MessageTap) -> Callable[[], None]:
+        """Call ``tap(record, cdr)`` for every message that leaves: publications, requests and responses.
+
+        Returns:
+            A function that removes the tap.
+        """
+        self.message_taps.append(tap)
+        return lambda: self.message_taps.remove(tap)
+
+    def add_filter(self, topic: str, filter_: Filter) -> Callable[[], None]:
+        """Put a fault between the publishers and the subscriptions of a topic.
+
+        Args:
+            topic: absolute name, or ``*`` for every topic.
+            filter_: called as ``filter_(record, cdr)`` for each publication; returns the copies to deliver, each as
+                (CDR bytes, further delay in ns): none drops the message, ``[(cdr, 0)]`` lets it pass. Several filters
+                act one after the other. A message that a filter delays may be overtaken. Taps see what was published.
+
+        Returns:
+            A function that removes the filter.
+        """
+        entry = (topic, filter_)
+        self.filters.append(entry)
+        return lambda: self.filters.remove(entry)
+
+    def new_message_id(self) -> int:
+        """Return the id of a message that is sent now, and note it with the callback that sends it."""
+        self.message_count += 1
+        if self.running is not None:
+            self.running.published.append(self.message_count)
+        return self.message_count
+
+    def announce(
+        self,
+        message_id: int,
+        kind: Literal["topic", "request", "response"],
+        name: str,
+        type_name: str,
+        node: Node,
+        data: bytes,
+    ) -> MessageRecord:
+        """Tell the message taps that a message leaves now; return its record."""
+        record = MessageRecord(
+            message_id, kind, name, type_name, node.get_fully_qualified_name(), self.now_ns, len(data)
+        )
+        for tap in list(self.message_taps):
+            tap(record, data)
+        return record
+
+    def filtered(self, record: MessageRecord, data: bytes) -> list[tuple[bytes, int]]:
+        """Return what the filters let through of a publication, with the further delay of each copy, ns."""
+        copies = [(data, 0)]
+        for topic, filter_ in list(self.filters):
+            if topic in ("*", record.name):
+                copies = [
+                    (after, delay + further) for before, delay in copies for after, further in filter_(record, before)
+                ]
+        return copies
 
     def get_logger(self) -> RcutilsLogger:
         """Return the logger of the context itself."""

@@ -11,6 +11,7 @@ became ready.
 
 from __future__ import annotations
 
+import heapq
 import inspect
 from collections import deque
 from collections.abc import Callable
@@ -20,7 +21,6 @@ from robotbrain.errors import InputError, RobotBrainError
 from robotbrain.ros.callback_groups import CallbackGroup
 from robotbrain.ros.context import CallbackRecord, CostModel, Execution, SimContext, get_default_context, set_running
 from robotbrain.ros.exceptions import CallbackError, ReentrancyError, SimulationDeadlockError
-from robotbrain.ros.resources import Segment
 from robotbrain.ros.task import Future
 
 if TYPE_CHECKING:
@@ -36,12 +36,16 @@ class TimeoutException(RobotBrainError):
 
 
 class Work:
-    """One ready callback: an entity, its payload (CDR bytes, a response, a coroutine) and when it got ready."""
+    """One ready callback: an entity, its payload (a message, a response, a coroutine) and when it got ready.
 
-    __slots__ = ("alive", "entity", "payload", "ready_ns", "resumed")
+    ``message`` is the id of the message that made it ready, 0 for none.
+    """
 
-    def __init__(self, entity: Any, payload: Any, ready_ns: int, resumed: bool = False) -> None:
-        self.entity, self.payload, self.ready_ns, self.resumed = entity, payload, ready_ns, resumed
+    __slots__ = ("alive", "entity", "message", "payload", "ready_ns", "resumed")
+
+    def __init__(self, entity: Any, payload: Any, ready_ns: int, message: int = 0, resumed: bool = False) -> None:
+        self.entity, self.payload, self.ready_ns = entity, payload, ready_ns
+        self.message, self.resumed = message, resumed
         self.alive = True
 
 
@@ -74,7 +78,9 @@ class Executor:
         self.num_threads = num_threads
         self.cost_model = cost_model
         self.executed = 0
-        self._free = num_threads
+        self.number = self.context.executor_count
+        self.context.executor_count += 1
+        self._idle = list(range(num_threads))  # a heap: the lowest worker that is free starts next
         self._priced_by: tuple[Any, Any, Any] = (None, None, None)
         self._ready: deque[Work] = deque()
         self._nodes: list[Node] = []
@@ -118,11 +124,11 @@ class Executor:
     def enqueue(self, work: Work) -> None:
         """Add a ready callback and start it if a worker and its callback group are free."""
         self._ready.append(work)
-        if self._free:
+        if self._idle:
             self._dispatch()
 
     def _dispatch(self) -> None:
-        while self._free:
+        while self._idle:
             work = self._next()
             if work is None:
                 return
@@ -144,12 +150,13 @@ class Executor:
     def _start(self, work: Work) -> None:
         context, entity = self.context, work.entity
         group: CallbackGroup = entity.callback_group
-        self._free -= 1
+        worker = heapq.heappop(self._idle)
         if not work.resumed:
             group.active += 1
         self.executed += 1
         model = self.cost_model or context.cost_model
-        execution = Execution(entity.node, model)
+        context.callback_count += 1
+        execution = Execution(entity.node, model, context.callback_count, work.message, worker)
         set_running(context, execution)
         failure: Exception | None = None
         suspended = False
@@ -161,21 +168,26 @@ class Executor:
             set_running(context, None)
             if model is not None:
                 self._price(model, work, execution)
+            if context.slowdown:
+                execution.segments = [
+                    (resource, max(1, round(length * context.slowdown.get(resource, 1.0))))
+                    for resource, length in execution.segments
+                ]
             segments, started = execution.segments, context.now_ns
             freed = None if suspended else group
             if not segments:
                 self._send(execution, started)
-                self._free += 1
+                heapq.heappush(self._idle, worker)
                 if freed is not None:
                     freed.active -= 1
             elif context.resources is None:
                 end = started + sum([length for _, length in segments])
                 self._send(execution, end)
-                context.schedule(end, self._finish, freed)
+                context.schedule(end, self._finish, (freed, worker))
             else:
                 context.resources.submit(segments, lambda: self._complete(work, execution, started, freed))
         if context.callback_taps and (not segments or context.resources is None):
-            self._record(work, segments, started, started + sum([length for _, length in segments]))
+            self._record(work, execution, started, started + sum([length for _, length in segments]))
         if failure is not None:
             self._fail(work, failure)
 
@@ -213,12 +225,12 @@ class Executor:
         """End a callback whose segments the device has done."""
         now = self.context.now_ns
         self._send(execution, now)
-        self.context.schedule(now, self._finish, group)
+        self.context.schedule(now, self._finish, (group, execution.worker))
         if self.context.callback_taps:
-            self._record(work, execution.segments, started_ns, now)
+            self._record(work, execution, started_ns, now)
 
-    def _record(self, work: Work, segments: list[Segment], started_ns: int, end_ns: int) -> None:
-        entity = work.entity
+    def _record(self, work: Work, execution: Execution, started_ns: int, end_ns: int) -> None:
+        entity, segments = work.entity, execution.segments
         record = CallbackRecord(
             entity.node.get_fully_qualified_name(),
             entity.kind,
@@ -228,12 +240,18 @@ class Executor:
             end_ns,
             sum([length for _, length in segments]),
             tuple(segments),
+            execution.id,
+            execution.message,
+            tuple(execution.published),
+            self.number,
+            execution.worker,
         )
         for tap in list(self.context.callback_taps):
             tap(record)
 
-    def _finish(self, group: CallbackGroup | None) -> None:
-        self._free += 1
+    def _finish(self, done: tuple[CallbackGroup | None, int]) -> None:
+        group, worker = done
+        heapq.heappush(self._idle, worker)
         if group is not None:
             group.active -= 1
         self._dispatch()
@@ -276,7 +294,9 @@ class Executor:
 
     def _resume(self, entity: Any, payload: tuple[Work, Any]) -> None:
         # Through the heap: the future may complete inside another callback of this very executor.
-        work = Work(entity, payload, self.context.now_ns, resumed=True)
+        running = self.context.running
+        message = running.message if running is not None else 0
+        work = Work(entity, payload, self.context.now_ns, message, resumed=True)
         self.context.release(lambda _: entity.node._enqueue(work), None)
 
     def _fail(self, work: Work, cause: Exception) -> None:

@@ -67,9 +67,9 @@ class Service(Entity):
         """Absolute service name."""
         return self.srv_name
 
-    def receive(self, request: tuple[Client, bytes, Future]) -> None:
+    def receive(self, request: tuple[Client, bytes, Future], message_id: int) -> None:
         """Queue a request that has arrived; a full queue loses its oldest, whose future never completes."""
-        work = Work(self, request, self.node.context.now_ns)
+        work = Work(self, request, self.node.context.now_ns, message_id)
         limit = self.qos_profile.queue_limit
         if limit is not None and len(self._queue) >= limit:
             lost = self._queue.popleft()
@@ -99,8 +99,8 @@ class Service(Entity):
                 f"{self.typename} Response it was given (is 'return response' missing?)"
             )
         client, _, future = work.payload
-        data = cdr.to_cdr(result)
-        self.node.context.release(client.deliver, (data, future))
+        context = self.node.context
+        context.release(client.deliver, (cdr.to_cdr(result), future, context.new_message_id(), self.node))
 
     def destroy(self) -> None:
         """Stop serving."""
@@ -149,32 +149,38 @@ class Client(Entity):
             )
         future = Future()
         future.completed_in = self.callback_group
-        self.node.context.release(self._send, (cdr.to_cdr(request), future))
+        context = self.node.context
+        context.release(self._send, (cdr.to_cdr(request), future, context.new_message_id()))
         return future
 
-    def _send(self, call: tuple[bytes, Future]) -> None:
+    def _send(self, call: tuple[bytes, Future, int]) -> None:
         context = self.node.context
+        if context.message_taps:
+            context.announce(call[2], "request", self.srv_name, self.typename, self.node, call[0])
         delay = context.transport_ns(self.srv_name, len(call[0]))
         context.schedule(context.now_ns + delay, self._arrive, call)
 
-    def _arrive(self, call: tuple[bytes, Future]) -> None:
+    def _arrive(self, call: tuple[bytes, Future, int]) -> None:
         server = self._server()
         if server is None:
             self.node.get_logger().warning(
                 f"request to {self.srv_name} is lost: no node offers this service. {self._offers()}"
             )
             return
-        server.receive((self, *call))
+        data, future, message_id = call
+        server.receive((self, data, future), message_id)
 
-    def deliver(self, answer: tuple[bytes, Future]) -> None:
+    def deliver(self, answer: tuple[bytes, Future, int, Node]) -> None:
         """Take a response on its way back."""
         context = self.node.context
+        if context.message_taps:
+            context.announce(answer[2], "response", self.srv_name, self.typename, answer[3], answer[0])
         delay = context.transport_ns(self.srv_name, len(answer[0]))
         context.schedule(context.now_ns + delay, self._receive, answer)
 
-    def _receive(self, answer: tuple[bytes, Future]) -> None:
+    def _receive(self, answer: tuple[bytes, Future, int, Node]) -> None:
         if not self.destroyed:
-            self.node._enqueue(Work(self, answer, self.node.context.now_ns))
+            self.node._enqueue(Work(self, answer[:2], self.node.context.now_ns, answer[2]))
 
     def execute(self, work: Work) -> Any:
         """Complete the future; its done callbacks run on this node's executor."""

@@ -15,8 +15,12 @@ from robotbrain.ros.messages import typename_of
 from robotbrain.ros.qos import DurabilityPolicy, QoSProfile, incompatibility
 
 if TYPE_CHECKING:
-    from robotbrain.ros.context import SimContext
+    from robotbrain.ros.context import MessageRecord, SimContext
     from robotbrain.ros.node import Node
+
+
+Packet = tuple[bytes, int]
+"""A message on its way: CDR, and its id."""
 
 
 class Topic:
@@ -84,7 +88,7 @@ class Publisher:
         self.published = 0
         self.destroyed = False
         self.matched: list[Subscription] = []
-        self.latched: deque[bytes] = deque(
+        self.latched: deque[Packet] = deque(
             maxlen=qos.queue_limit if qos.durability == DurabilityPolicy.TRANSIENT_LOCAL else 0
         )
         self._last_arrival_ns = 0
@@ -121,26 +125,43 @@ class Publisher:
         if self.destroyed:
             raise InvalidHandle(f"publisher {self.topic} was destroyed and cannot publish")
         self.published += 1
-        self.node.context.release(self._release, data)
+        context = self.node.context
+        context.release(self._release, (data, context.new_message_id()))
 
-    def _release(self, data: bytes) -> None:
+    def _release(self, packet: Packet) -> None:
         context, topic = self.node.context, self._topic
+        data, message_id = packet
         now = context.now_ns
         for tap in context.taps:
             tap(now, topic.name, topic.typename, self.node.get_fully_qualified_name(), data)
         if self.latched.maxlen != 0:
-            self.latched.append(data)
+            self.latched.append(packet)
+        record = None
+        if context.message_taps or context.filters:
+            record = context.announce(message_id, "topic", topic.name, topic.typename, self.node, data)
         if not self.matched:
+            return
+        if record is not None and context.filters:
+            self._deliver_filtered(record, data)
             return
         latency = context.transport_ns(topic.name, len(data))
         # A later message never overtakes an earlier one of this publisher, whatever their sizes.
         arrival = self._last_arrival_ns = max(now + latency, self._last_arrival_ns)
         if arrival == now:
             for subscription in self.matched:
-                subscription.receive(data)
+                subscription.receive(packet)
         else:
             for subscription in self.matched:
-                context.schedule(arrival, subscription.receive, data)
+                context.schedule(arrival, subscription.receive, packet)
+
+    def _deliver_filtered(self, record: MessageRecord, data: bytes) -> None:
+        context = self.node.context
+        for copy, delay in context.filtered(record, data):
+            arrival = context.now_ns + context.transport_ns(record.name, len(copy)) + delay
+            if not delay:
+                arrival = self._last_arrival_ns = max(arrival, self._last_arrival_ns)
+            for subscription in self.matched:
+                context.schedule(arrival, subscription.receive, (copy, record.id))
 
     def get_subscription_count(self) -> int:
         """Return how many subscriptions this publisher reaches."""
@@ -193,21 +214,21 @@ class Subscription(Entity):
             if reason := incompatibility(publisher.qos_profile, qos):
                 _warn_mismatch(self._topic, publisher, self, reason)
             elif qos.durability == DurabilityPolicy.TRANSIENT_LOCAL:
-                for data in publisher.latched:
-                    latency = context.transport_ns(topic, len(data))
-                    context.schedule(context.now_ns + latency, self.receive, data)
+                for packet in publisher.latched:
+                    latency = context.transport_ns(topic, len(packet[0]))
+                    context.schedule(context.now_ns + latency, self.receive, packet)
 
     @property
     def topic_name(self) -> str:
         """Absolute topic name."""
         return self.topic
 
-    def receive(self, data: bytes) -> None:
+    def receive(self, packet: Packet) -> None:
         """Queue a message that has arrived; a full KEEP_LAST queue loses its oldest."""
         if self.destroyed:
             return
         self.received += 1
-        work = Work(self, data, self.node.context.now_ns)
+        work = Work(self, packet, self.node.context.now_ns, packet[1])
         queue = self._queue
         if self._limit is not None and len(queue) >= self._limit:
             queue.popleft().alive = False
@@ -218,7 +239,8 @@ class Subscription(Entity):
     def execute(self, work: Work) -> Any:
         """Decode the message and call back."""
         self._queue.remove(work)
-        message = work.payload if self.raw else cdr.from_cdr(work.payload, self.msg_type)
+        data = work.payload[0]
+        message = data if self.raw else cdr.from_cdr(data, self.msg_type)
         assert self.callback is not None
         return self.callback(message)
 
