@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robotbrain.errors import InputError
-from robotbrain.jetson.profiles import JetsonProfile
+from robotbrain.jetson.profiles import PRECISION, JetsonProfile
 
 
 class OnnxEngine:
@@ -22,6 +22,7 @@ class OnnxEngine:
         profile: the Jetson it is deployed to; None means an inference takes no simulated time.
         image_size: (width, height) of the images whose latency is charged; None: those that it infers.
         charged_as: ONNX file whose latency is charged; None: that of ``model``.
+        precision: ``fp32``, ``fp16`` or ``int8``, whose latency is charged; here it is computed in float32.
 
     Attributes:
         path: of the ONNX file.
@@ -35,6 +36,7 @@ class OnnxEngine:
         profile: JetsonProfile | None = None,
         image_size: tuple[int, int] | None = None,
         charged_as: str | Path | None = None,
+        precision: str = PRECISION,
     ) -> None:
         import onnxruntime
 
@@ -66,6 +68,7 @@ class OnnxEngine:
         self.resource = "gpu"
         self._image_size = image_size
         self._charged_as = path if charged_as is None else Path(charged_as)
+        self._precision = precision
         self._latency_ns: int | None = None
         self._input = self._session.get_inputs()[0]
         self._output: str = self._session.get_outputs()[0].name
@@ -81,7 +84,8 @@ class OnnxEngine:
         if self.profile is None:
             return 0
         if self._latency_ns is None:
-            self._latency_ns = round(self.profile.network_ms(self._charged_as, image_size=self._image_size) * 1e6)
+            latency_ms = self.profile.network_ms(self._charged_as, self._precision, self._image_size)
+            self._latency_ns = round(latency_ms * 1e6)
         return self._latency_ns
 
     def infer(self, batch: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -156,8 +156,9 @@ def make_parts(
     mounting = (mount.x, mount.y, mount.z, mount.pitch)
     parts: dict[str, Callable[[], Any]] = {
         "perception": lambda: PerceptionNode(
-            OnnxEngine(model or default_model(), profile, deployed.image_size, deployed.network),
+            OnnxEngine(model or default_model(), profile, deployed.image_size, deployed.network, deployed.precision),
             mounting,
+            deployed.camera_queue,
         ),
         "estimator": lambda: EstimatorNode(sim.robot.wheel_radius, sim.robot.track),
         "mapper": MapperNode,

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from robotbrain.errors import InputError
+from robotbrain.jetson.kernels import PRECISIONS
+from robotbrain.jetson.profiles import PRECISION
 from robotbrain.jetson.resize import check_image_size
 
 
@@ -24,12 +26,17 @@ class Deployment:
         scan_rays: beams per scan that the lidar is charged for; None: what the simulator casts.
         one_thread: all brain nodes share one single-threaded executor, as with one ``rclpy.spin`` in one process:
             each callback, inference included, delays all others. Otherwise each node is a process of its own.
+        precision: ``fp32``, ``fp16`` or ``int8``: what the network's latency is predicted for. The kit's network itself
+            computes in float32 here.
+        camera_queue: images that may wait for perception; None: as many as come (KEEP_ALL).
     """
 
     image_size: tuple[int, int] | None = None
     network: str | Path | None = None
     scan_rays: int | None = None
     one_thread: bool = False
+    precision: str = PRECISION
+    camera_queue: int | None = 1
 
     def __post_init__(self) -> None:
         if self.image_size is not None:
@@ -37,6 +44,18 @@ class Deployment:
         if self.network is not None and not Path(self.network).is_file():
             raise InputError(
                 "network", given=str(self.network), expected="the path of an ONNX file", fix="Check the path."
+            )
+        if self.precision not in PRECISIONS:
+            raise InputError(
+                "precision",
+                given=self.precision,
+                expected="one of " + ", ".join(PRECISIONS),
+                fix="Choose one of these.",
+            )
+        queue = self.camera_queue
+        if queue is not None and (isinstance(queue, bool) or not isinstance(queue, int) or queue < 1):
+            raise InputError(
+                "camera_queue", given=queue, expected="a whole number >= 1, or None", fix="1 keeps the newest image."
             )
         rays = self.scan_rays
         if rays is not None and (isinstance(rays, bool) or not isinstance(rays, int) or not 1 <= rays <= 100_000):

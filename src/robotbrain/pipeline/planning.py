@@ -345,13 +345,24 @@ def plan_path(
     *,
     tolerance: float = 0.3,
     params: InflationParams | None = None,
+    crop: bool = True,
 ) -> PlanResult:
     """Inflate, search and straighten: from metres to metres.
 
     A start inside the lethal zone (the robot stopped close to an obstacle) is moved to the nearest free cell; a goal in
     it is moved to the nearest free cell within ``tolerance`` metres.
+
+    Args:
+        occupancy: (rows, columns) percent, -1 for unknown.
+        frame: where its cells lie.
+        start, goal: x, y in the map frame, m.
+        tolerance: how far from a goal that cannot be reached the path may end, m.
+        params: inflation.
+        crop: plan on the part of the map that is known, and its surroundings, instead of on all of it.
     """
-    grid, frame = _crop(check_occupancy(occupancy), frame, (start, goal))
+    grid = check_occupancy(occupancy)
+    if crop:
+        grid, frame = _crop(grid, frame, (start, goal))
     cost = inflate(grid, frame.resolution, params)
     start_cell, goal_cell = frame.to_cell(*start), frame.to_cell(*goal)
     begin = nearest_free(cost, start_cell, int(0.5 / frame.resolution))

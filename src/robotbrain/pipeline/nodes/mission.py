@@ -37,10 +37,14 @@ class MissionNode(Node):
 
     Subscribes ``perception/marker``, ``odometry/filtered``, ``map``; calls the service ``plan``; publishes ``plan``,
     ``goal_pose`` (only for a confirmed marker) and, once there, ``goal_reached``.
+
+    Args:
+        replan_after: how old a path may grow before another is asked for, s.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, replan_after: float = REPLAN_AFTER) -> None:
         super().__init__("mission")
+        self._replan_after = replan_after
         self._poses = StampedPoses()
         self._marker = MarkerTracker()
         self._views: ViewMemory | None = None
@@ -135,7 +139,7 @@ class MissionNode(Node):
 
     def _request(self, pose: Pose, goal: tuple[float, float], now: float) -> None:
         moved = self._planned_for is None or float(np.hypot(*np.subtract(goal, self._planned_for))) > 0.1
-        if self._pending is not None or not (moved or now - self._planned_at > REPLAN_AFTER):
+        if self._pending is not None or not (moved or now - self._planned_at > self._replan_after):
             return
         if not self._client.service_is_ready():
             return

@@ -6,7 +6,7 @@ import numpy as np
 from geometry_msgs.msg import PointStamped
 from numpy.typing import NDArray
 from rclpy.node import Node
-from rclpy.qos import qos_profile_sensor_data
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from robotbrain.jetson.engine import OnnxEngine
@@ -21,6 +21,7 @@ from robotbrain.pipeline.segmentation import (
 from robotbrain.ros import charge, charge_work
 from robotbrain.ros.conversions import image_to_numpy, numpy_to_image, points_to_cloud
 
+BEST_EFFORT = ReliabilityPolicy.BEST_EFFORT
 FLOOR_LABEL, OBSTACLE_LABEL = 0.0, 1.0
 """Third coordinate of a published point: 0 on the floor, 1 on an obstacle (the points themselves are flat)."""
 
@@ -35,9 +36,10 @@ class PerceptionNode(Node):
     Args:
         engine: runs the network; its latency is charged to simulated time.
         mounting: (x, y, z, pitch) of the camera on the base, m and rad.
+        queue: images that may wait; the oldest makes way. None: as many as come.
     """
 
-    def __init__(self, engine: OnnxEngine, mounting: tuple[float, float, float, float]) -> None:
+    def __init__(self, engine: OnnxEngine, mounting: tuple[float, float, float, float], queue: int | None = 1) -> None:
         super().__init__("perception")
         self._engine = engine
         self._mounting = mounting
@@ -47,8 +49,12 @@ class PerceptionNode(Node):
         self._marker_pub = self.create_publisher(PointStamped, "perception/marker", 10)
         self._points_pub = self.create_publisher(PointCloud2, "perception/points", 10)
         self.create_subscription(CameraInfo, "camera/camera_info", self._on_info, 10)
-        self.create_subscription(Image, "camera/depth", self._on_depth, qos_profile_sensor_data)
-        self.create_subscription(Image, "camera/image", self._on_image, 1)
+        keep_all = QoSProfile(history=HistoryPolicy.KEEP_ALL)
+        # An image is of no use without its depth, which came just before: as many of those must be able to wait.
+        depths = keep_all if queue is None else QoSProfile(depth=max(5, queue), reliability=BEST_EFFORT)
+        self.create_subscription(Image, "camera/depth", self._on_depth, depths)
+        images = keep_all if queue is None else QoSProfile(depth=queue)
+        self.create_subscription(Image, "camera/image", self._on_image, images)
 
     def _on_info(self, msg: CameraInfo) -> None:
         x, y, z, pitch = self._mounting

@@ -18,11 +18,12 @@ class PlannerNode(Node):
 
     Args:
         params: inflation; defaults suit the kit's robot.
+        crop: plan on the known part of the map only (see plan_path).
     """
 
-    def __init__(self, params: InflationParams | None = None) -> None:
+    def __init__(self, params: InflationParams | None = None, crop: bool = True) -> None:
         super().__init__("planner")
-        self._params = params
+        self._params, self._crop = params, crop
         self._map: OccupancyGrid | None = None
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.create_subscription(OccupancyGrid, "map", self._on_map, latched)
@@ -44,6 +45,7 @@ class PlannerNode(Node):
             (goal.x, goal.y),
             tolerance=float(request.tolerance),
             params=self._params,
+            crop=self._crop,
         )
         charge_work("costmap", result.cells)
         charge_work("astar", result.expanded)
