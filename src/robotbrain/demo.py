@@ -63,9 +63,7 @@ def main(arguments: argparse.Namespace) -> int:
 
 
 def _grade(course: Any, out: Path, jobs: int, fresh: bool) -> tuple[ClassResult, dict[str, dict[str, Any]]]:
-    from tqdm import tqdm
-
-    from robotbrain.grading.classroom import grade_class
+    from robotbrain.grading.classroom import grade_class, progress_bar
     from robotbrain.grading.course import generate
     from robotbrain.grading.marks import table
     from robotbrain.grading.sample import make_class
@@ -74,13 +72,7 @@ def _grade(course: Any, out: Path, jobs: int, fresh: bool) -> tuple[ClassResult,
     generate(course, LAB)
     manifest = make_class(course, LAB, out / "class")
     print(f"2. Grading a sample class of {len(manifest)} submissions with nbgrader, {jobs} at a time")
-    with tqdm(total=len(manifest), unit="submission", file=sys.stderr, disable=None) as bar:
-
-        def progress(done: int, total: int, student: str) -> None:
-            bar.total = total
-            bar.set_postfix_str(student, refresh=False)
-            bar.update(done - bar.n)
-
+    with progress_bar() as progress:
         result = grade_class(
             course,
             LAB,

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,6 +46,21 @@ class _Task:
     healed: intake.Healed
     folder: Path
     cache: Path
+
+
+@contextlib.contextmanager
+def progress_bar() -> Iterator[Callable[[int, int, str], None]]:
+    """Show a bar on a terminal; gives the ``progress`` function of :func:`grade_class`."""
+    from tqdm import tqdm
+
+    with tqdm(unit="submission", file=sys.stderr, disable=None) as bar:
+
+        def progress(done: int, total: int, student: str) -> None:
+            bar.total = total
+            bar.set_postfix_str(student, refresh=False)
+            bar.update(done - bar.n)
+
+        yield progress
 
 
 def grade_class(

@@ -72,19 +72,11 @@ def grade_class_arguments(parser: argparse.ArgumentParser) -> None:
 
 def grade_class_main(arguments: argparse.Namespace) -> int:
     """Run ``robotbrain grade-class``."""
-    from tqdm import tqdm
-
-    from robotbrain.grading.classroom import grade_class
+    from robotbrain.grading.classroom import grade_class, progress_bar
     from robotbrain.grading.course import find_course
     from robotbrain.grading.marks import table
 
-    with tqdm(unit="submission", file=sys.stderr, disable=None) as bar:
-
-        def progress(done: int, total: int, student: str) -> None:
-            bar.total = total
-            bar.set_postfix_str(student, refresh=False)
-            bar.update(done - bar.n)
-
+    with progress_bar() as progress:
         result = grade_class(
             find_course(arguments.course),
             arguments.lab,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_left
 
 import numpy as np
@@ -17,8 +18,8 @@ def wrap_angle(angle: ArrayLike) -> NDArray[np.float64]:
 
 
 def wrap(angle: float) -> float:
-    """Return one angle wrapped to [-pi, pi), rad."""
-    return float((angle + np.pi) % (2 * np.pi) - np.pi)
+    """Return one angle wrapped to [-pi, pi), rad: the fast path of :func:`wrap_angle`."""
+    return (float(angle) + math.pi) % (2 * math.pi) - math.pi
 
 
 def transform(pose: ArrayLike, points: ArrayLike) -> NDArray[np.float64]:
