@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-import html.parser
 import math
-import re
 from pathlib import Path
 from typing import Any
 
 import nbformat
 import pytest
-from nbclient import NotebookClient
 
-from robotbrain import notebooks
-from robotbrain.grading import Lab, Report, Verdict, load_suite
+from robotbrain.grading import Report, Verdict, load_suite
 from robotbrain.grading.suites import lesson_02
 from robotbrain.jetson.catalogue import list_modules, load_module
 from robotbrain.jetson.software import load_headlines, load_jetpacks, newest_jetpack
 from robotbrain.jetson.twin import Prediction, compare
 from robotbrain.jetson.twin.data import load_kernel_lists
+from tests import lessons
+from tests.lessons import hints
 
 NAME = "02_jetson_platforms"
-LONGEST = 25  # lines of a cell in a lesson
 
 
 @pytest.fixture(scope="module")
@@ -36,12 +33,7 @@ def lesson(path: Path) -> Any:
 
 @pytest.fixture(scope="module")
 def executed(path: Path) -> Any:
-    """The lesson after a run from a clean kernel; a cell that raises fails every test that asks for it."""
-    notebook = nbformat.read(path, as_version=4)
-    # What the prose claims about the twin, as a cell of its own: there is no other way into the kernel.
-    notebook.cells.append(nbformat.v4.new_code_cell(CLAIMS))
-    NotebookClient(notebook, timeout=90, resources={"metadata": {"path": str(path.parent)}}).execute()
-    return notebook
+    return lessons.execute(path, CLAIMS)
 
 
 CLAIMS = """
@@ -65,84 +57,25 @@ assert not traces["passive"].shut_down
 """
 
 
-def outputs(notebook: Any, kind: str) -> list[str]:
-    return [
-        output["data"][kind]
-        for cell in notebook.cells
-        for output in cell.get("outputs", [])
-        if kind in output.get("data", {})
-    ]
-
-
-class Tags(html.parser.HTMLParser):
-    """Collects the tags of a page with their attributes."""
-
-    def __init__(self, page: str) -> None:
-        super().__init__()
-        self.found: list[tuple[str, dict[str, str | None]]] = []
-        self.feed(page)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.found.append((tag, dict(attrs)))
-
-
 # ---------------------------------------------------------------- the notebook
 
 
-def test_the_file_is_canonical_and_its_cells_are_short(path: Path, lesson: Any) -> None:
-    assert notebooks.problems(path) == ([], [])
-    for cell in lesson.cells:
-        if cell.cell_type == "code":
-            lines = cell.source.splitlines()
-            assert len(lines) <= LONGEST, cell.id
-            assert max(map(len, lines)) <= 120, cell.id
-
-
-def test_every_part_of_a_lesson_is_there(lesson: Any) -> None:
-    text = "\n".join(cell.source for cell in lesson.cells if cell.cell_type == "markdown")
-    for part in (
-        "You will be able to",
-        "**Time:**",
-        "## Summary",
-        "**Further reading.**",
-        "## Going to the real hardware",
-    ):
-        assert part in text
-    assert "## What changed since the course outline" in text
-    assert set(re.findall(r"Exercise (\d)", text)) == set("123456")
+def test_the_form_of_a_lesson(path: Path) -> None:
+    lessons.check_form(path, exercises="123456")
 
 
 def test_it_runs_from_the_top_and_says_nothing_on_stderr(executed: Any) -> None:
-    for cell in executed.cells:
-        for output in cell.get("outputs", []):
-            assert output.output_type != "error", cell.id
-            assert output.get("name") != "stderr", f"{cell.id}: {output.get('text')}"
+    lessons.check_silent(executed)
 
 
 def test_every_figure_and_table_can_be_read_by_everybody(executed: Any) -> None:
-    found = Tags("\n".join(outputs(executed, "text/html"))).found
-    images = [attributes for tag, attributes in found if tag == "img"]
-    drawings = [attributes for tag, attributes in found if tag == "svg"]
-    assert len(images) >= 6 and len(drawings) == 2
-    assert all(len(image.get("alt") or "") > 40 for image in images)
-    assert all(drawing.get("role") == "img" and drawing.get("aria-label") for drawing in drawings)
-    assert not outputs(executed, "image/png")  # such an image would have no alt text
-    tables = [page for page in outputs(executed, "text/html") if page.startswith("<table style")]
-    assert len(tables) >= 8 and all("<caption" in page and 'scope="row"' in page for page in tables)
-
-
-def test_images_in_the_text_exist_and_have_alt_text(path: Path, lesson: Any) -> None:
-    images = [found for cell in lesson.cells for found in re.findall(r"!\[(.*?)\]\((.*?)\)", cell.source)]
-    assert images
-    for alt, target in images:
-        assert len(alt) > 40 and (path.parent / target).is_file()
+    lessons.check_readable(executed, figures=6, tables=8)
+    drawings = [tag for tag, _ in lessons.Tags("\n".join(lessons.outputs(executed, "text/html"))).found if tag == "svg"]
+    assert len(drawings) == 2
 
 
 def test_open_exercises_are_reported_kindly(executed: Any) -> None:
-    reports = [text for text in outputs(executed, "text/plain") if "of 1 points" in text or " points\n" in text]
-    assert len(reports) == len(load_suite("lesson_02").exercises)
-    for text in reports:
-        assert "not written yet" in text and "hint" not in text and "raised" not in text
+    lessons.check_open_exercises(executed, "lesson_02")
 
 
 # ---------------------------------------------------------------- prose against the catalogue
@@ -202,11 +135,7 @@ def test_what_the_prose_says_about_jetpack_agrees_with_the_table() -> None:
 
 
 def check(exercise: str, **answers: Any) -> Report:
-    return Lab("lesson_02", namespace=answers).check(exercise)
-
-
-def hints(report: Report) -> set[str]:
-    return {result.hint_key for result in report.results if result.hint_key}
+    return lessons.check("lesson_02", exercise, **answers)
 
 
 def fp32_peak_gflops(module: Any, mode: Any) -> float:

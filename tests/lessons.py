@@ -1,0 +1,120 @@
+"""What is asked of every lesson; each lesson's own tests call these with its notebook."""
+
+from __future__ import annotations
+
+import html.parser
+import re
+from pathlib import Path
+from typing import Any
+
+import nbformat
+from nbclient import NotebookClient
+
+from robotbrain import notebooks
+from robotbrain.grading import Lab, Report, load_suite
+
+LONGEST = 25  # lines of a cell in a lesson
+PARTS = (
+    "You will be able to",
+    "**Time:**",
+    "## Summary",
+    "**Further reading.**",
+    "## Going to the real hardware",
+    "## What changed since the course outline",
+)
+
+
+def execute(path: Path, claims: str = "", timeout: int = 90) -> Any:
+    """Return the notebook after a run from a clean kernel; a cell that raises fails the test that asks for it.
+
+    Args:
+        path: of the notebook.
+        claims: what the prose says about results, as code: it runs as a last cell.
+        timeout: of a cell, s.
+    """
+    notebook = nbformat.read(path, as_version=4)
+    if claims:
+        notebook.cells.append(nbformat.v4.new_code_cell(claims))
+    NotebookClient(notebook, timeout=timeout, resources={"metadata": {"path": str(path.parent)}}).execute()
+    return notebook
+
+
+def outputs(notebook: Any, kind: str) -> list[str]:
+    """Return all outputs of one MIME type."""
+    return [
+        output["data"][kind]
+        for cell in notebook.cells
+        for output in cell.get("outputs", [])
+        if kind in output.get("data", {})
+    ]
+
+
+class Tags(html.parser.HTMLParser):
+    """Collects the tags of a page with their attributes."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.found: list[tuple[str, dict[str, str | None]]] = []
+        self.feed(page)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.found.append((tag, dict(attrs)))
+
+
+def check_form(path: Path, exercises: str) -> None:
+    """The file is canonical, its cells are short, and every part of a lesson is there."""
+    assert notebooks.problems(path) == ([], [])
+    lesson = nbformat.read(path, as_version=4)
+    for cell in lesson.cells:
+        if cell.cell_type == "code":
+            lines = cell.source.splitlines()
+            assert len(lines) <= LONGEST, cell.id
+            assert max(map(len, lines)) <= 120, cell.id
+    text = "\n".join(cell.source for cell in lesson.cells if cell.cell_type == "markdown")
+    for part in PARTS:
+        assert part in text, part
+    assert set(re.findall(r"Exercise (\d)", text)) == set(exercises)
+    for target in re.findall(r"\]\(([^)#:]+\.(?:ipynb|svg|png))\)", text):
+        assert (path.parent / target).is_file(), target
+    for alt, target in re.findall(r"!\[(.*?)\]\((.*?)\)", text):
+        assert len(alt) > 40, target
+
+
+def check_silent(executed: Any) -> None:
+    """No cell failed, and none wrote to stderr."""
+    for cell in executed.cells:
+        for output in cell.get("outputs", []):
+            assert output.output_type != "error", cell.id
+            assert output.get("name") != "stderr", f"{cell.id}: {output.get('text')}"
+
+
+def check_readable(executed: Any, figures: int, tables: int = 0) -> None:
+    """There are so many figures and tables at least, and each can be read by everybody."""
+    pages = outputs(executed, "text/html")
+    found = Tags("\n".join(page for page in pages if "<iframe" not in page)).found
+    images = [attributes for tag, attributes in found if tag == "img"]
+    assert len(images) >= figures
+    assert all(len(image.get("alt") or "") > 40 for image in images)
+    drawings = [attributes for tag, attributes in found if tag == "svg"]
+    assert all(drawing.get("role") == "img" and drawing.get("aria-label") for drawing in drawings)
+    assert not outputs(executed, "image/png")  # such an image would have no alt text
+    shown = [page for page in pages if page.startswith("<table style")]
+    assert len(shown) >= tables and all("<caption" in page and 'scope="row"' in page for page in shown)
+
+
+def check_open_exercises(executed: Any, suite: str) -> None:
+    """A check of an exercise that nobody has begun says just that."""
+    reports = [text for text in outputs(executed, "text/plain") if re.search(r"of \d+ points", text)]
+    assert len(reports) == len(load_suite(suite).exercises)
+    for text in reports:
+        assert "not written yet" in text and "hint" not in text and "raised" not in text, text
+
+
+def check(suite: str, exercise: str, **answers: Any) -> Report:
+    """Return the report on a student's answers."""
+    return Lab(suite, namespace=answers).check(exercise)
+
+
+def hints(report: Report) -> set[str]:
+    """Return the keys of the hints that a report gives."""
+    return {result.hint_key for result in report.results if result.hint_key}
