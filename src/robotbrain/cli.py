@@ -26,7 +26,11 @@ class Command(NamedTuple):
 COMMANDS: dict[str, Command] = {
     "demo": Command("robotbrain.demo", "grade the sample class, drive the robot, show one page"),
     "drive": Command("robotbrain.pipeline.commands:drive", "let a brain drive in worlds of your choice"),
+    "robot": Command("robotbrain.link.commands:robot", "the simulated robot as a process of its own"),
+    "estop": Command("robotbrain.link.commands:estop", "set or release the emergency stop of such a robot"),
+    "bag": Command("robotbrain.ros.bag_command:bag", "look into a recorded run, check it, make it whole"),
     "lab": Command("robotbrain.jupyter", "open JupyterLab on the course"),
+    "monitor": Command("robotbrain.monitoring.commands:monitor", "watch a brain drive, or this machine"),
     "jetson": Command("robotbrain.jetson.commands:jetson", "what a network takes on a Jetson module: the twin"),
     "train": Command("robotbrain.training.commands:train", "train a shipped network again"),
     "grade": Command("robotbrain.grading.commands:grade", "grade one notebook and print the report"),

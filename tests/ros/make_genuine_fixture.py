@@ -2,7 +2,7 @@
 
 Not run by the tests. In a virtual environment of its own (Linux x86-64, Python 3.11 or later)::
 
-    pip install ros-kilted-rclpy ros-kilted-rmw-fastrtps-cpp ros-kilted-common-interfaces
+    pip install ros-kilted-rclpy ros-kilted-rmw-fastrtps-cpp ros-kilted-common-interfaces ros-kilted-test-msgs
     python tests/ros/make_genuine_fixture.py
 """
 
@@ -39,10 +39,29 @@ PACKAGES = (
     "unique_identifier_msgs",
     "visualization_msgs",
 )
+ACTIONS = ("test_msgs/action/Fibonacci",)
+
+
+def action_classes(typename: str) -> dict[str, type]:
+    package, kind, name = typename.split("/")
+    action = getattr(importlib.import_module(f"{package}.{kind}"), name)
+    impl = action.Impl
+    return {
+        f"{typename}_Goal": action.Goal,
+        f"{typename}_Result": action.Result,
+        f"{typename}_Feedback": action.Feedback,
+        f"{typename}_SendGoal_Request": impl.SendGoalService.Request,
+        f"{typename}_SendGoal_Response": impl.SendGoalService.Response,
+        f"{typename}_GetResult_Request": impl.GetResultService.Request,
+        f"{typename}_GetResult_Response": impl.GetResultService.Response,
+        f"{typename}_FeedbackMessage": impl.FeedbackMessage,
+    }
 
 
 def classes() -> dict[str, type]:
     found = {}
+    for action in ACTIONS:
+        found |= action_classes(action)
     for package in PACKAGES:
         for kind in ("msg", "srv"):
             try:

@@ -44,6 +44,9 @@ def _scalar(kind: str, rng: random.Random) -> Any:
     if kind == "string":
         return rng.choice(["", "a", "häß", "base_link", "x" * rng.randrange(9)])
     package, name = kind.split("/")
+    if name.endswith(("_Goal", "_Result", "_Feedback")):
+        action, _, part = name.rpartition("_")
+        return random_message(getattr(load_class(f"{package}/action/{action}"), part), rng)
     return random_message(load_class(f"{package}/msg/{name}"), rng)
 
 

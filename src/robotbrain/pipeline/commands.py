@@ -32,7 +32,12 @@ def drive_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``robotbrain drive``."""
     parser.add_argument("--seeds", default="0", help="worlds to drive in: one seed, or a range such as 0:100")
     parser.add_argument("--difficulty", type=float, default=0.5, help="of the worlds, 0 to 1 (default 0.5)")
-    parser.add_argument("--robot", choices=["nominal", "surrogate"], default="nominal", help="which robot")
+    parser.add_argument(
+        "--robot",
+        choices=["nominal", "surrogate", "ros"],
+        default="nominal",
+        help="which robot: simulated here, or (ros) one in another process or a physical one, in wall-clock time",
+    )
     parser.add_argument("--profile", default="orin-nano-8gb", help="Jetson that the brain runs on, e.g. nano-4gb:5W")
     parser.add_argument("--mode", help="its power mode (default: the module's)")
     parser.add_argument(
@@ -43,10 +48,75 @@ def drive_arguments(parser: argparse.ArgumentParser) -> None:
         "ResNet-50's size, with all nodes in one thread or each in a process of its own",
     )
     parser.add_argument("--html", type=Path, help="write a 3D replay of the last run to this file")
+    _ros_arguments(parser.add_argument_group("with --robot ros"))
+
+
+def _ros_arguments(group: argparse._ArgumentGroup) -> None:
+    from robotbrain.link.handshake import DEFAULT_PORT
+
+    group.add_argument(
+        "--transport",
+        choices=["local", "rclpy", "dds"],
+        default="local",
+        help="local: `robotbrain robot` on this computer; rclpy: genuine ROS 2; dds: a DDS network without ROS 2 here",
+    )
+    group.add_argument("--address", default=f"127.0.0.1:{DEFAULT_PORT}", help="of the robot, host:port (local)")
+    group.add_argument("--token", help="of the robot (local; default: the one it left in this user's files)")
+    group.add_argument("--domain", type=int, default=0, help="DDS domain (dds)")
+    group.add_argument("--description", type=Path, help="TOML file that describes the robot (default: the kit's)")
+    group.add_argument("--use-sim-time", action="store_true", help="take the time from /clock")
+    group.add_argument("--no-preflight", action="store_true", help="drive without checking rates, frames and clocks")
+    group.add_argument("--time-limit", type=float, default=120.0, help="end the drive after this long, s")
+    group.add_argument("--bag", type=Path, help="record all topics to a rosbag2 folder of this name")
+    group.add_argument("--decisions", type=Path, help="write commands, plans and goals to this file, as JSON lines")
+    group.add_argument(
+        "--part", action="append", default=[], metavar="ROLE=FILE.py:CLASS", help="a node of your own in the brain"
+    )
+
+
+def _drive_ros(arguments: argparse.Namespace) -> int:
+    """Drive a robot outside this process."""
+    from robotbrain.link.commands import end_on_terminate
+    from robotbrain.link.description import RobotDescription, load_description
+    from robotbrain.link.handshake import parse_address
+    from robotbrain.link.runtime import use_kit
+    from robotbrain.pipeline.remote import RemoteOptions, drive_remote, load_part
+
+    end_on_terminate()
+    host, port = parse_address(arguments.address)
+    options = RemoteOptions(
+        transport=arguments.transport,
+        host=host,
+        port=port,
+        token=arguments.token,
+        domain=arguments.domain,
+        follow_clock=arguments.use_sim_time,
+        preflight=not arguments.no_preflight,
+        time_limit=arguments.time_limit,
+        bag=arguments.bag,
+        decisions=arguments.decisions,
+    )
+    robot = load_description(arguments.description) if arguments.description else RobotDescription()
+    if arguments.transport != "rclpy":
+        use_kit()  # before the files of --part import rclpy
+    parts = dict(load_part(spec) for spec in arguments.part)
+    run = drive_remote(options, robot, parts=parts, say=lambda text: print(text, flush=True))
+    print(f"{run.reason}, after {run.seconds:.1f} s and {run.commands} commands")
+    if run.decisions:
+        print("  decisions: " + ", ".join(f"{topic} {count}" for topic, count in run.decisions.items()))
+    for topic, (count, mean, worst, dropped) in run.links.items():
+        print(f"  {topic}: {count} messages, {mean:.2f} ms old on arrival (worst {worst:.1f}), {dropped} dropped")
+    if run.pace:
+        print(f"pace: {run.pace}")
+    if run.log_sha256:
+        print(f"decision log of the brain: {run.log_sha256}")
+    return 0 if run.reached else 1
 
 
 def drive_main(arguments: argparse.Namespace) -> int:
     """Drive, one line a run, and a summary."""
+    if arguments.robot == "ros":
+        return _drive_ros(arguments)
     from robotbrain.errors import InputError
     from robotbrain.pipeline.brain import drive
 

@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 
 class CallbackGroup:
-    """Base of the callback groups."""
+    """Base of the callback groups.
+
+    Attributes:
+        active: callbacks of the group that run now.
+    """
 
     def __init__(self) -> None:
         self.active = 0
 
-    def can_execute(self) -> bool:
+    def has_entity(self, entity: Any) -> bool:
+        """Tell whether a timer, subscription, service or client belongs to this group."""
+        return getattr(entity, "callback_group", None) is self and not getattr(entity, "destroyed", False)
+
+    def can_execute(self, entity: Any = None) -> bool:
         """Tell whether one more callback of this group may start now."""
         raise NotImplementedError
 
@@ -17,7 +27,7 @@ class CallbackGroup:
 class ReentrantCallbackGroup(CallbackGroup):
     """Callbacks of this group run in parallel, each with itself too."""
 
-    def can_execute(self) -> bool:
+    def can_execute(self, entity: Any = None) -> bool:
         """Return True."""
         return True
 
@@ -25,6 +35,6 @@ class ReentrantCallbackGroup(CallbackGroup):
 class MutuallyExclusiveCallbackGroup(CallbackGroup):
     """At most one callback of this group runs at a time."""
 
-    def can_execute(self) -> bool:
+    def can_execute(self, entity: Any = None) -> bool:
         """Return True while no callback of the group runs."""
         return self.active == 0

@@ -15,15 +15,22 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 from robotbrain.errors import InputError
 from robotbrain.ros.exceptions import CallbackError, NotInitializedException, ReentrancyError
-from robotbrain.ros.logging import LoggingSeverity, LogSink, RcutilsLogger, print_sink
-from robotbrain.ros.names import NodeArguments, parse_arguments
+from robotbrain.ros.logging import (
+    LoggingSeverity,
+    LogRecord,
+    LogSink,
+    RcutilsLogger,
+    get_logging_severity_from_string,
+    print_sink,
+)
+from robotbrain.ros.arguments import NodeArguments, parse_arguments
 from robotbrain.ros.resources import RESOURCES, DeviceResources, Segment
 
 if TYPE_CHECKING:
     from robotbrain.ros.executors import Executor
     from robotbrain.ros.node import Node
     from robotbrain.ros.services import Service
-    from robotbrain.ros.topics import Topic
+    from robotbrain.ros.matching import Topic
 
 Event = Callable[[Any], None]
 Tap = Callable[[int, str, str, str, bytes], None]
@@ -188,6 +195,8 @@ class SimContext:
         self.default_executor_factory: Callable[[Node], Executor] = lambda node: SingleThreadedExecutor(context=self)
         self.log_sink: LogSink = print_sink
         self.log_level = LoggingSeverity.INFO
+        self.log_levels: dict[str, LoggingSeverity] = {}
+        self.rosout: dict[str | None, Callable[[LogRecord, Any], None]] = {}
         self.horizon_ns: int | None = None
         self.arguments = NodeArguments()
         self.topics: dict[str, Topic] = {}
@@ -201,7 +210,11 @@ class SimContext:
         self.executor_count = 0
         self.callback_count = 0
         self.message_count = 0
+        self.goal_count = 0
         self.running: Execution | None = None
+        self.holding = False
+        self.held: list[Executor] = []
+        self._arrivals: list[tuple[Event, Any]] | None = None
         self._heap: list[tuple[int, int, Event, Any]] = []
         self._sequence = 0
         self._failures: deque[CallbackError] = deque()
@@ -222,6 +235,11 @@ class SimContext:
             raise RuntimeError("Context.init() must only be called once; call rclpy.shutdown() first")
         self._init_called = True
         self.arguments = parse_arguments(args)
+        for logger, level in self.arguments.log_levels:
+            if logger:
+                self.log_levels[logger] = get_logging_severity_from_string(level)
+            else:
+                self.log_level = get_logging_severity_from_string(level)
 
     def ok(self) -> bool:
         """Tell whether the context has not been shut down."""
@@ -275,6 +293,32 @@ class SimContext:
             self.running.outbox.append((event, argument))
         else:
             self.schedule(self.now_ns, event, argument)
+
+    def arrive_together(self, arrivals: list[tuple[Event, Any]], time_ns: int | None = None) -> None:
+        """Run these events at ``time_ns`` (now by default), with all that are given for now before the next step.
+
+        Executors start nothing until all of them have run: a queue that they overflow then loses its oldest.
+        """
+        if time_ns is not None and time_ns > self.now_ns:
+            self.schedule(time_ns, self._arrive, arrivals)
+        elif self._arrivals is not None:
+            self._arrivals += arrivals
+        else:
+            self._arrivals = arrivals
+            self.schedule(self.now_ns, self._arrive, arrivals)
+
+    def _arrive(self, arrivals: list[tuple[Event, Any]]) -> None:
+        if arrivals is self._arrivals:
+            self._arrivals = None
+        self.holding = True
+        try:
+            for event, argument in arrivals:
+                event(argument)
+        finally:
+            self.holding = False
+            held, self.held = self.held, []
+            for executor in held:
+                executor.dispatch()
 
     def charge(self, nanoseconds: int, resource: str = "cpu") -> bool:
         """Add to the cost of the running callback; return False (and do nothing) outside callbacks.

@@ -24,6 +24,7 @@ class Entity:
     """
 
     kind: ClassVar[str] = ""
+    cancelled = False
 
     def __init__(self, node: Node, name: str, callback: Callable[..., Any] | None, group: CallbackGroup | None) -> None:
         if callback is not None and not callable(callback):

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import TYPE_CHECKING
 
 from robotbrain.errors import InputError, RobotBrainError
@@ -21,6 +22,9 @@ class NotInitializedException(RobotBrainError):
 
 class ROSInterruptException(RobotBrainError):
     """A blocking call was interrupted by shutdown."""
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*(args or ("rclpy.shutdown() has been called",)))
 
 
 class InvalidNameException(InputError):
@@ -47,6 +51,14 @@ class InvalidHandle(RobotBrainError):
     """A publisher, subscription, timer, service, client or node was used after it was destroyed."""
 
 
+class RCLError(RobotBrainError, RuntimeError):
+    """The client library refuses: a transition of a goal's state that there is not, say."""
+
+
+class NodeNameNonExistentError(RCLError, InputError):
+    """The graph has no node of that name."""
+
+
 class ParameterException(InputError):
     """Base of the parameter errors."""
 
@@ -61,6 +73,14 @@ class ParameterAlreadyDeclaredException(ParameterException):
 
 class ParameterUninitializedException(ParameterException):
     """A parameter was declared by type only and has no value yet."""
+
+
+class InvalidParameterException(ParameterException):
+    """A parameter has no proper name."""
+
+
+class ParameterImmutableException(ParameterException):
+    """A read-only parameter was to be changed or undeclared."""
 
 
 class InvalidParameterTypeException(ParameterException):
@@ -90,19 +110,45 @@ class ReentrancyError(RobotBrainError, RuntimeError):
 class CallbackError(RobotBrainError, RuntimeError):
     """A callback raised. The original exception is ``__cause__`` (and ``cause``).
 
+    It is also an instance of the original's class, so that ``except KeyError`` around ``spin`` works as in genuine rclpy,
+    which raises the original.
+
     Attributes:
         node: the node whose callback it was.
         callback: readable name of the callback.
-        kind: ``timer``, ``subscription``, ``service`` or ``client``.
-        name: topic, service or timer name.
+        kind: ``timer``, ``subscription``, ``service``, ``client``, ``action``, ``task``, ``event`` or
+            ``guard_condition``.
+        name: topic, service, action or timer name.
         time_ns: simulated time at which the callback started.
         cause: the exception it raised.
     """
 
+    def __new__(cls, node: Node, *, cause: BaseException, **details: object) -> CallbackError:
+        """Make an instance of the class that is both."""
+        try:
+            return type(cause).__new__(_with(cls, type(cause)))  # type: ignore[return-value]
+        except TypeError:  # an exception whose constructor wants more
+            return Exception.__new__(cls)
+
     def __init__(self, node: Node, *, callback: str, kind: str, name: str, time_ns: int, cause: BaseException) -> None:
-        self.node, self.callback, self.kind, self.name = node, callback, kind, name
-        self.time_ns, self.cause = time_ns, cause
-        super().__init__(
+        text = (
             f"{type(cause).__name__} in {kind} callback {callback} ({name}) of node "
             f"{node.get_fully_qualified_name()} at simulated time {time_ns / 1e9:.9f} s: {cause}"
         )
+        self.__dict__.update(vars(cause))
+        Exception.__init__(self, text)
+        self.node, self.callback, self.kind, self.name = node, callback, kind, name
+        self.time_ns, self.cause = time_ns, cause
+
+    def __str__(self) -> str:
+        return str(self.args[0])
+
+
+@functools.cache
+def _with(cls: type[CallbackError], cause: type[BaseException]) -> type[CallbackError]:
+    if issubclass(cls, cause) or not issubclass(cause, Exception):
+        return cls
+    try:
+        return type(cls.__name__, (cls, cause), {"__module__": cls.__module__, "__doc__": cls.__doc__})
+    except TypeError:  # classes whose instances are laid out differently
+        return cls

@@ -17,22 +17,40 @@ from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from robotbrain.errors import InputError, RobotBrainError
+from robotbrain.errors import InputError
 from robotbrain.ros.callback_groups import CallbackGroup
 from robotbrain.ros.context import CallbackRecord, CostModel, Execution, SimContext, get_default_context, set_running
-from robotbrain.ros.exceptions import CallbackError, ReentrancyError, SimulationDeadlockError
-from robotbrain.ros.task import Future
+from robotbrain.ros.exceptions import CallbackError, ReentrancyError
+from robotbrain.ros.spinning import (
+    ConditionReachedException,
+    ExternalShutdownException,
+    ShutdownException,
+    Spinner,
+    TimeoutException,
+)
+from robotbrain.ros.task import Future, Task
 
 if TYPE_CHECKING:
     from robotbrain.ros.node import Node
 
+__all__ = [
+    "ConditionReachedException",
+    "Executor",
+    "ExternalShutdownException",
+    "MultiThreadedExecutor",
+    "ShutdownException",
+    "SingleThreadedExecutor",
+    "TimeoutException",
+    "Work",
+    "await_or_execute",
+    "message_size",
+]
 
-class ExternalShutdownException(RobotBrainError):
-    """The context was shut down, or its horizon reached, while spinning."""
 
-
-class TimeoutException(RobotBrainError):
-    """A wait ran out of time."""
+async def await_or_execute(callback: Callable[..., Any], *args: Any) -> Any:
+    """Call ``callback(*args)``, await it if it is a coroutine function, and return its result."""
+    result = callback(*args)
+    return await result if inspect.iscoroutine(result) else result
 
 
 class Work:
@@ -58,7 +76,17 @@ def message_size(payload: Any) -> int | None:
     return None
 
 
-class Executor:
+class _NoNode:
+    """Stands for the node of tasks of an executor that has no nodes."""
+
+    def __init__(self, executor: Executor) -> None:
+        self._enqueue = executor.enqueue
+
+    def get_fully_qualified_name(self) -> str:
+        return "/"
+
+
+class Executor(Spinner):
     """Base of the executors.
 
     Args:
@@ -84,6 +112,9 @@ class Executor:
         self._priced_by: tuple[Any, Any, Any] = (None, None, None)
         self._ready: deque[Work] = deque()
         self._nodes: list[Node] = []
+        self._is_shutdown = False
+        self._budget = -1  # callbacks that spin_once may still start; negative: no limit
+        self._deferred = False
 
     # ------------------------------------------------------------ nodes
 
@@ -110,8 +141,9 @@ class Executor:
         """Return the nodes attached."""
         return list(self._nodes)
 
-    def shutdown(self, timeout_sec: float | None = None) -> bool:
-        """Detach all nodes."""
+    def shutdown(self, timeout_sec: float | None = None, *, wait_for_threads: bool = True) -> bool:
+        """Detach all nodes and let ``spin`` return; what has begun is finished. Returns True."""
+        self._is_shutdown = True
         for node in list(self._nodes):
             self.remove_node(node)
         return True
@@ -119,20 +151,70 @@ class Executor:
     def wake(self) -> None:
         """Do nothing: a simulated executor never sleeps."""
 
+    def __enter__(self) -> Executor:
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        self.shutdown()
+
+    # ------------------------------------------------------------ tasks
+
+    def create_task(self, callback: Callable[..., Any], *args: Any, **kwargs: Any) -> Task:
+        """Run ``callback(*args, **kwargs)``, plain or ``async def``, on this executor; return its future.
+
+        A task that a callback creates starts when that callback's cost is over, in no callback group. It counts as
+        work of the node whose callback created it, or else of the executor's first node.
+        """
+        running = self.context.running
+        owner: Any = running.node if running is not None else None
+        if owner not in self._nodes:
+            owner = self._nodes[0] if self._nodes else _NoNode(self)
+        task = Task(callback, args, kwargs, node=owner)
+        self.context.release(self._begin, task)
+        return task
+
+    def _begin(self, task: Task) -> None:
+        work = Work(task.entity, None, self.context.now_ns)
+        if isinstance(task.entity.node, _NoNode):
+            self.enqueue(work)
+        else:
+            task.entity.node._enqueue(work)
+
+    def create_future(self) -> Future:
+        """Return a new future."""
+        return Future(executor=self)
+
     # ------------------------------------------------------------ execution
 
     def enqueue(self, work: Work) -> None:
         """Add a ready callback and start it if a worker and its callback group are free."""
         self._ready.append(work)
         if self._idle:
-            self._dispatch()
+            if self.context.holding:
+                self.context.held.append(self)
+            else:
+                self.dispatch()
 
-    def _dispatch(self) -> None:
+    def _occupied(self) -> bool:
+        return self.num_threads == 1 and not self._idle
+
+    def dispatch(self) -> None:
+        """Start what is ready, as far as workers and callback groups are free."""
         while self._idle:
+            if not self._budget:
+                if self._ready and not self._deferred:
+                    self._deferred = True
+                    self.context.schedule(self.context.now_ns, self._go_on)
+                return
             work = self._next()
             if work is None:
                 return
+            self._budget -= 1
             self._start(work)
+
+    def _go_on(self, _: None) -> None:
+        self._deferred = False
+        self.dispatch()
 
     def _next(self) -> Work | None:
         ready = self._ready
@@ -254,11 +336,13 @@ class Executor:
         heapq.heappush(self._idle, worker)
         if group is not None:
             group.active -= 1
-        self._dispatch()
+        self.dispatch()
 
     def _call(self, work: Work) -> bool:
         """Run a callback, or the next part of a coroutine; tell whether it now waits for a future."""
         entity = work.entity
+        if entity.cancelled:
+            return False
         if not work.resumed:
             result = entity.execute(work)
             if not inspect.iscoroutine(result):
@@ -278,7 +362,8 @@ class Executor:
                 "awaited object",
                 given=awaited,
                 expected="an rclpy Future",
-                fix="In a callback await client.call_async(...); asyncio objects need asyncio's own loop.",
+                fix="In a callback await client.call_async(...) or robotbrain.ros.sleep(node, seconds); "
+                "asyncio objects need asyncio's own loop.",
             )
         group = entity.callback_group
         if awaited.completed_in is group and not group.can_execute():
@@ -311,71 +396,6 @@ class Executor:
         )
         error.__cause__ = cause
         self.context.fail(error)
-
-    # ------------------------------------------------------------ spinning
-
-    def spin(self) -> None:
-        """Run the simulation until shutdown, until its horizon, or until nothing is left to happen.
-
-        Raises:
-            ExternalShutdownException: the horizon was reached (as Ctrl-C in genuine rclpy).
-        """
-        context = self.context
-        context.check_not_in_callback("spin")
-        while context.ok():
-            upcoming = context.next_event_ns()
-            if upcoming is None:
-                context.get_logger().info("spin: no event is pending, so nothing can happen any more; shutting down")
-                context.try_shutdown()
-                return
-            if context.horizon_ns is not None and upcoming > context.horizon_ns:
-                context.run_until(max(context.now_ns, context.horizon_ns))
-                context.try_shutdown()
-                raise ExternalShutdownException(f"the context's horizon ({context.horizon_ns} ns) was reached")
-            context.step()
-
-    def spin_once(self, timeout_sec: float | None = None) -> None:
-        """Run the simulation until one callback of this executor has been executed, or the time is over."""
-        before = self.executed
-        self._spin_while(lambda: self.executed == before, timeout_sec, "spin_once")
-
-    def spin_until_future_complete(self, future: Future, timeout_sec: float | None = None) -> None:
-        """Run the simulation until ``future`` is done, or the time is over.
-
-        Raises:
-            SimulationDeadlockError: no timeout, and no pending event can complete the future.
-        """
-        self._spin_while(lambda: not future.done(), timeout_sec, "spin_until_future_complete")
-
-    def spin_once_until_future_complete(self, future: Future, timeout_sec: float | None = None) -> None:
-        """Run one callback of this executor, or until ``future`` is done, or the time is over."""
-        before = self.executed
-        self._spin_while(
-            lambda: self.executed == before and not future.done(), timeout_sec, "spin_once_until_future_complete"
-        )
-
-    def _spin_while(self, waiting: Callable[[], bool], timeout_sec: float | None, what: str) -> None:
-        context = self.context
-        context.check_not_in_callback(what)
-        deadline = None
-        if timeout_sec is not None and timeout_sec >= 0:
-            deadline = context.now_ns + round(timeout_sec * 1e9)
-        while context.ok() and waiting():
-            upcoming = context.next_event_ns()
-            limits = [limit for limit in (deadline, context.horizon_ns) if limit is not None]
-            if upcoming is not None and not (limits and upcoming > min(limits)):
-                context.step()
-                continue
-            if not limits:
-                raise SimulationDeadlockError(
-                    f"{what} waits for something that cannot happen: no event is pending "
-                    f"at {context.now_ns / 1e9:.9f} s. Is the timer, publisher or service you wait for created?"
-                )
-            context.run_until(max(context.now_ns, min(limits)))
-            if context.horizon_ns is not None and min(limits) == context.horizon_ns and deadline != context.horizon_ns:
-                context.try_shutdown()
-                raise ExternalShutdownException(f"the context's horizon ({context.horizon_ns} ns) was reached")
-            return
 
 
 class SingleThreadedExecutor(Executor):

@@ -31,7 +31,20 @@ class FieldNameError(InputError, AttributeError):
     """A message has no field of that name."""
 
 
-class Message:
+class MessageTypeError(InputError, AttributeError):
+    """Something else than a message class was given (genuine rclpy raises AttributeError)."""
+
+
+class MessageType(type):
+    """Type of the message classes: their constants stay what they are."""
+
+    def __setattr__(cls, name: str, value: Any) -> None:
+        if name in cls.__dict__.get("_constants", ()):
+            raise AttributeError(f"{name} is a constant of {cls.__dict__['__msgtype__']}")
+        super().__setattr__(name, value)
+
+
+class Message(metaclass=MessageType):
     """Base of all generated message classes."""
 
     __slots__ = ()
@@ -43,9 +56,13 @@ class Message:
     def __init__(self, **fields: Any) -> None:
         for setter, factory in self._factories:
             setter(self, factory())
-        fields.pop("check_fields", None)  # accepted by genuine rclpy; the kit always checks
-        for name, value in fields.items():
-            setattr(self, name, value)
+        if fields:
+            fields.pop("check_fields", None)  # accepted by genuine rclpy; the kit always checks
+            for name, value in fields.items():
+                check = self._checks.get(name)
+                if check is None:
+                    self._no_field(name, FieldError)
+                check(self, value)
 
     def __setattr__(self, name: str, value: Any) -> None:
         check = self._checks.get(name)
@@ -56,11 +73,11 @@ class Message:
     def __getattr__(self, name: str) -> NoReturn:
         self._no_field(name)
 
-    def _no_field(self, name: str) -> NoReturn:
+    def _no_field(self, name: str, error: type[InputError] = FieldNameError) -> NoReturn:
         known = ", ".join(self._fields_and_field_types) or "none"
         if name.startswith("__"):
             raise AttributeError(name)
-        raise FieldNameError(
+        raise error(
             f"field of {self.__msgtype__}", given=name, expected=f"one of: {known}", fix="Check the spelling."
         )
 
@@ -139,10 +156,11 @@ def message_class(typename: str) -> type[Message]:
         __slots__=tuple("_" + field for field in fields),
         __module__=f"{package}.{kind}",
         __msgtype__=typename,
+        _constants=frozenset(name for name, _ in definition.constants),
         __doc__=f"{typename}: " + ", ".join(f"{field} ({type_.idl})" for field, type_ in fields.items()),
         _fields_and_field_types={field: type_.idl for field, type_ in fields.items()},
     )
-    cls: type[Message] = type(name, (Message,), namespace)
+    cls: type[Message] = MessageType(name, (Message,), namespace)
     checks, factories = {}, []
     for field, type_ in fields.items():
         slot = cls.__dict__["_" + field]
@@ -153,12 +171,20 @@ def message_class(typename: str) -> type[Message]:
     return cls
 
 
+def _not_made(cls: type) -> NoReturn:
+    parts = [name for name in ("Request", "Response", "Goal", "Result", "Feedback") if hasattr(cls, name)]
+    raise NotImplementedError(
+        f"{cls.__name__} is only a name: make " + " or ".join(f"{cls.__name__}.{part}()" for part in parts)
+    )
+
+
 @functools.cache
 def service_class(typename: str) -> type:
     """Return the class of a service (``pkg/srv/Name``) with nested ``Request`` and ``Response``."""
     package, kind, name = typename.split("/")
     request, response = message_class(typename + "_Request"), message_class(typename + "_Response")
     namespace = {
+        "__new__": _not_made,
         "__module__": f"{package}.{kind}",
         "__srvtype__": typename,
         "__doc__": f"{typename}: Request and Response classes.",
@@ -171,6 +197,40 @@ def service_class(typename: str) -> type:
 def is_service(typename: str) -> bool:
     """Tell whether ``pkg/srv/Name`` is a service the kit knows."""
     return f"{typename}_Request" in typenames()
+
+
+@functools.cache
+def action_class(typename: str) -> type:
+    """Return the class of an action (``pkg/action/Name``) with nested ``Goal``, ``Result``, ``Feedback`` and ``Impl``."""
+    package, kind, name = typename.split("/")
+    impl = type(
+        "Impl",
+        (),
+        {
+            "__doc__": f"What carries {typename}: three services and two topics.",
+            "SendGoalService": service_class(typename + "_SendGoal"),
+            "GetResultService": service_class(typename + "_GetResult"),
+            "CancelGoalService": service_class("action_msgs/srv/CancelGoal"),
+            "FeedbackMessage": message_class(typename + "_FeedbackMessage"),
+            "GoalStatusMessage": message_class("action_msgs/msg/GoalStatusArray"),
+        },
+    )
+    namespace = {
+        "__new__": _not_made,
+        "__module__": f"{package}.{kind}",
+        "__actiontype__": typename,
+        "__doc__": f"{typename}: Goal, Result and Feedback classes.",
+        "Goal": message_class(typename + "_Goal"),
+        "Result": message_class(typename + "_Result"),
+        "Feedback": message_class(typename + "_Feedback"),
+        "Impl": impl,
+    }
+    return type(name, (), namespace)
+
+
+def is_action(typename: str) -> bool:
+    """Tell whether ``pkg/action/Name`` is an action the kit knows."""
+    return f"{typename}_SendGoal_Request" in typenames()
 
 
 # ---------------------------------------------------------------- defaults
@@ -375,7 +435,7 @@ def typename_of(cls: Any) -> str:
     name = getattr(cls, "__msgtype__", None)
     if isinstance(cls, type) and isinstance(name, str) and name:
         return name
-    raise InputError(
+    raise MessageTypeError(
         "message type",
         given=cls,
         expected="a message class such as geometry_msgs.msg.Twist",

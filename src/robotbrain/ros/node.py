@@ -5,23 +5,39 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from robotbrain.ros.callback_groups import CallbackGroup, MutuallyExclusiveCallbackGroup
+from robotbrain.ros.arguments import parse_arguments
+from robotbrain.ros.callback_groups import CallbackGroup, MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from robotbrain.ros.clock import Clock, ROSClock
 from robotbrain.ros.context import SimContext, get_default_context
-from robotbrain.ros.exceptions import InvalidHandle
+from robotbrain.ros.exceptions import InvalidHandle, NodeNameNonExistentError
+from robotbrain.ros.guard_condition import GuardCondition
 from robotbrain.ros.logging import RcutilsLogger
-from robotbrain.ros.names import check_namespace, check_node_name, expand, parse_arguments
-from robotbrain.ros.parameter import Parameter, ParameterSet
-from robotbrain.ros.qos import QoSProfile, as_profile, qos_profile_services_default
+from robotbrain.ros.names import check_namespace, check_node_name, expand
+from robotbrain.ros.node_graph import NodeGraph
+from robotbrain.ros.node_parameters import NodeParameters
+from robotbrain.ros.parameter import Parameter
+from robotbrain.ros.parameter_service import ParameterService
+from robotbrain.ros.parameter_set import ParameterSet
+from robotbrain.ros.qos import QoSProfile, as_profile, best_available, qos_profile_services_default
+from robotbrain.ros.qos_overriding_options import override_qos
+from robotbrain.ros.rate import Rate
 from robotbrain.ros.services import Client, Service
+from robotbrain.ros.system_topics import (
+    SYSTEM_TOPICS,
+    add_system_publisher,
+    join_system_topics,
+    leave_system_topics,
+)
 from robotbrain.ros.timer import Timer
 from robotbrain.ros.topics import Publisher, Subscription
+
+__all__ = ["Node", "NodeNameNonExistentError", "Parameter"]
 
 if TYPE_CHECKING:
     from robotbrain.ros.executors import Executor, Work
 
 
-class Node:
+class Node(NodeGraph, NodeParameters):
     """A node of the simulated graph.
 
     Args:
@@ -33,8 +49,10 @@ class Node:
         parameter_overrides: list of :class:`Parameter` that replace declared defaults.
         allow_undeclared_parameters: read and set parameters without declaring them.
         automatically_declare_parameters_from_overrides: declare every override.
-        enable_rosout: accepted; the kit has no ``/rosout``.
-        start_parameter_services: accepted; the kit does not start them.
+        enable_rosout: tell what is logged on ``/rosout``, when somebody listens.
+        rosout_qos_profile: accepted; the kit's ``/rosout`` has the default one.
+        start_parameter_services: let other nodes read and set the parameters.
+        enable_logger_service: accepted; the kit does not start it.
 
     Raises:
         NotInitializedException: ``rclpy.init()`` was not called.
@@ -50,6 +68,7 @@ class Node:
         namespace: str | None = None,
         use_global_arguments: bool = True,
         enable_rosout: bool = True,
+        rosout_qos_profile: QoSProfile | int | None = None,
         start_parameter_services: bool = True,
         parameter_overrides: list[Parameter] | None = None,
         allow_undeclared_parameters: bool = False,
@@ -61,30 +80,34 @@ class Node:
         arguments = parse_arguments(cli_args)
         if use_global_arguments:
             arguments = self.context.arguments.merged(arguments)
-        self._name = check_node_name(arguments.node_name or node_name)
-        self._namespace = check_namespace(arguments.namespace or namespace)
+        check_node_name(node_name)
+        self._name = check_node_name(arguments.special(("__node", "__name"), node_name) or node_name)
+        self._namespace = check_namespace(arguments.special(("__ns",), node_name) or namespace)
         self._full_name = f"{'' if self._namespace == '/' else self._namespace}/{self._name}"
-        self._remappings = {
-            expand(left, self._name, self._namespace): expand(right, self._name, self._namespace)
-            for left, right in arguments.remappings.items()
-        }
+        self._remappings = arguments.names_of(self._name, self._namespace)
         self._executor: Executor | None = None
         self._parked: list[Work] = []
         self._entities: list[Any] = []
+        self._system_publishers: dict[str, Publisher] = {}
+        self._rosout = enable_rosout
         self._destroyed = False
         self._default_group = MutuallyExclusiveCallbackGroup()
         self._clock = ROSClock(context=self.context)
-        self._logger = RcutilsLogger(self._full_name.strip("/").replace("/", "."), self.context)
-        overrides = dict(arguments.parameters)
+        logger_name = self._full_name.strip("/").replace("/", ".")
+        self._logger = RcutilsLogger(logger_name, self.context, logger_name)
+        overrides = arguments.parameters_of(self._full_name)
         overrides.update({parameter.name: parameter.value for parameter in parameter_overrides or ()})
         self._parameters = ParameterSet(self, overrides, allow_undeclared_parameters)
-        self._parameters.declare("use_sim_time", True, None, False)
+        join_system_topics(self)
         if automatically_declare_parameters_from_overrides:
             for name, value in overrides.items():
-                if not self._parameters.has(name):
-                    self._parameters.declare(name, value, None, False)
+                self._parameters.declare(name, value, None, True)
+        if not self._parameters.has("use_sim_time"):
+            self._parameters.declare("use_sim_time", True, None, False)
         if any(node.get_fully_qualified_name() == self._full_name for node in self.context.nodes):
             self._logger.warning(f"two nodes are called {self._full_name}; costs and logs cannot tell them apart")
+        elif start_parameter_services:
+            ParameterService(self)
         self.context.nodes.append(self)
         self.context.default_executor_factory(self).add_node(self)
 
@@ -165,6 +188,17 @@ class Node:
         if self._destroyed:
             raise InvalidHandle(f"node {self._full_name} was destroyed and cannot create anything")
 
+    def _qos(self, kind: str, topic: str, qos: QoSProfile, overriding: Any) -> QoSProfile:
+        """Return the profile of a new endpoint: a copy, with overrides from parameters and BEST_AVAILABLE resolved."""
+        qos = QoSProfile(**qos.__dict__)
+        if overriding is not None:
+            override_qos(self, kind, topic, qos, overriding)
+        known = self.context.topics.get(topic)
+        others: list[Any] = []
+        if known is not None:
+            others = list(known.subscriptions if kind == "publisher" else known.publishers)
+        return best_available(qos, [other.qos_profile for other in others], offers=kind == "publisher")
+
     def create_publisher(
         self,
         msg_type: Any,
@@ -178,7 +212,9 @@ class Node:
     ) -> Publisher:
         """Create a publisher; ``qos_profile`` may be an integer depth."""
         self._check_alive()
-        publisher = publisher_class(self, msg_type, self.resolve_topic_name(topic), as_profile(qos_profile))
+        name, qos = self.resolve_topic_name(topic), as_profile(qos_profile)
+        qos = self._qos("publisher", name, qos, qos_overriding_options)
+        publisher = publisher_class(self, msg_type, name, qos, callback_group, event_callbacks)
         self._keep(publisher)
         return publisher
 
@@ -196,9 +232,12 @@ class Node:
     ) -> Subscription:
         """Create a subscription; ``raw`` gives the callback CDR bytes instead of a message."""
         self._check_alive()
-        subscription = Subscription(
-            self, msg_type, self.resolve_topic_name(topic), callback, as_profile(qos_profile), callback_group, raw
-        )
+        name, qos = self.resolve_topic_name(topic), as_profile(qos_profile)
+        qos = self._qos("subscription", name, qos, qos_overriding_options)
+        if name in SYSTEM_TOPICS:
+            for node in self.context.nodes:
+                add_system_publisher(node, name)
+        subscription = Subscription(self, msg_type, name, callback, qos, callback_group, raw, event_callbacks)
         self._keep(subscription)
         return subscription
 
@@ -212,9 +251,29 @@ class Node:
     ) -> Timer:
         """Create a timer; its first call is one period from now."""
         self._check_alive()
-        timer = Timer(self, timer_period_sec, callback, callback_group, autostart)
+        timer = Timer(self, timer_period_sec, callback, callback_group, autostart, clock)
         self._keep(timer)
         return timer
+
+    def create_rate(self, frequency: float, clock: Clock | None = None) -> Rate:
+        """Create a rate of ``frequency`` Hz, for loops outside callbacks.
+
+        Raises:
+            ValueError: not a number > 0.
+        """
+        if not frequency > 0:
+            raise ValueError("frequency must be > 0")
+        timer = self.create_timer(1 / frequency, lambda: None, ReentrantCallbackGroup(), clock)
+        return Rate(timer)
+
+    def create_guard_condition(
+        self, callback: Callable[[], Any], callback_group: CallbackGroup | None = None
+    ) -> GuardCondition:
+        """Create a guard condition: ``callback`` runs after each ``trigger()``."""
+        self._check_alive()
+        guard = GuardCondition(self, callback, callback_group)
+        self._keep(guard)
+        return guard
 
     def create_service(
         self,
@@ -273,6 +332,16 @@ class Node:
         """Destroy a client; return False if it is not one of this node."""
         return self._destroy(client)
 
+    def destroy_guard_condition(self, guard: GuardCondition) -> bool:
+        """Destroy a guard condition; return False if it is not one of this node."""
+        return self._destroy(guard)
+
+    def destroy_rate(self, rate: Rate) -> bool:
+        """Destroy a rate; return False if it is not one of this node."""
+        known = rate._timer in self._entities
+        rate.destroy()
+        return known
+
     def destroy_node(self) -> None:
         """Destroy the node and all it created; nothing of it runs any more."""
         if self._destroyed:
@@ -280,10 +349,23 @@ class Node:
         self._destroyed = True
         for entity in list(self._entities):
             entity.destroy()
+        leave_system_topics(self)
         if self._executor is not None:
             self._executor.remove_node(self)
         self._parked.clear()
         self.context.nodes.remove(self)
+
+    def _all_parts(self) -> list[Any]:
+        """Return all publishers, subscriptions, services and clients, also those that actions are made of."""
+        parts = list(self._system_publishers.values())
+        for entity in self._entities:
+            parts += getattr(entity, "parts", (entity,))
+        return parts
+
+    @property
+    def guards(self) -> list[GuardCondition]:
+        """Guard conditions of this node."""
+        return [entity for entity in self._entities if isinstance(entity, GuardCondition)]
 
     @property
     def publishers(self) -> list[Publisher]:
@@ -310,90 +392,11 @@ class Node:
         """Clients of this node."""
         return [entity for entity in self._entities if isinstance(entity, Client)]
 
-    # ------------------------------------------------------------ graph
+    def __enter__(self) -> Node:
+        return self
 
-    def get_topic_names_and_types(self, no_demangle: bool = False) -> list[tuple[str, list[str]]]:
-        """Return every topic of the graph with its types, sorted by name."""
-        return [(name, [topic.typename]) for name, topic in sorted(self.context.topics.items())]
-
-    def get_service_names_and_types(self) -> list[tuple[str, list[str]]]:
-        """Return every service of the graph with its types, sorted by name."""
-        return [(name, [service.typename]) for name, service in sorted(self.context.services.items())]
-
-    def get_node_names(self) -> list[str]:
-        """Return the names of all nodes."""
-        return [node.get_name() for node in self.context.nodes]
-
-    def get_node_names_and_namespaces(self) -> list[tuple[str, str]]:
-        """Return names and namespaces of all nodes."""
-        return [(node.get_name(), node.get_namespace()) for node in self.context.nodes]
-
-    def count_publishers(self, topic_name: str) -> int:
-        """Return the number of publishers on a topic."""
-        topic = self.context.topics.get(self.resolve_topic_name(topic_name))
-        return len(topic.publishers) if topic else 0
-
-    def count_subscribers(self, topic_name: str) -> int:
-        """Return the number of subscriptions to a topic."""
-        topic = self.context.topics.get(self.resolve_topic_name(topic_name))
-        return len(topic.subscriptions) if topic else 0
-
-    # ------------------------------------------------------------ parameters
-
-    def declare_parameter(
-        self, name: str, value: Any = None, descriptor: Any = None, ignore_override: bool = False
-    ) -> Parameter:
-        """Declare a parameter with its default; an override given at start-up replaces the default."""
-        return self._parameters.declare(name, value, descriptor, ignore_override)
-
-    def declare_parameters(
-        self, namespace: str, parameters: Sequence[tuple[Any, ...]], ignore_override: bool = False
-    ) -> list[Parameter]:
-        """Declare ``(name, default[, descriptor])`` tuples, names prefixed by ``namespace`` and a dot."""
-        prefix = f"{namespace}." if namespace else ""
-        declared = []
-        for name, *rest in parameters:
-            value, descriptor = [*rest, None, None][:2]
-            declared.append(self.declare_parameter(prefix + name, value, descriptor, ignore_override))
-        return declared
-
-    def undeclare_parameter(self, name: str) -> None:
-        """Remove a declared parameter."""
-        self._parameters.undeclare(name)
-
-    def has_parameter(self, name: str) -> bool:
-        """Tell whether a parameter is declared."""
-        return self._parameters.has(name)
-
-    def get_parameter(self, name: str) -> Parameter:
-        """Return a parameter; its value is ``.value``."""
-        return self._parameters.get(name)
-
-    def get_parameters(self, names: Sequence[str]) -> list[Parameter]:
-        """Return several parameters."""
-        return [self._parameters.get(name) for name in names]
-
-    def get_parameter_or(self, name: str, alternative_value: Parameter | None = None) -> Parameter:
-        """Return a parameter, or the alternative when it is not declared."""
-        if self._parameters.has(name):
-            return self._parameters.get(name)
-        return alternative_value if alternative_value is not None else Parameter(name)
-
-    def set_parameters(self, parameter_list: Sequence[Parameter]) -> list[Any]:
-        """Set parameters one by one; return a ``SetParametersResult`` for each."""
-        return [self._parameters.set([parameter]) for parameter in parameter_list]
-
-    def set_parameters_atomically(self, parameter_list: Sequence[Parameter]) -> Any:
-        """Set all parameters or none; return one ``SetParametersResult``."""
-        return self._parameters.set(parameter_list)
-
-    def add_on_set_parameters_callback(self, callback: Callable[[list[Parameter]], Any]) -> None:
-        """Ask ``callback(parameters)`` before each change; its ``SetParametersResult`` decides."""
-        self._parameters.callbacks.insert(0, callback)
-
-    def remove_on_set_parameters_callback(self, callback: Callable[[list[Parameter]], Any]) -> None:
-        """Stop asking ``callback``."""
-        self._parameters.callbacks.remove(callback)
+    def __exit__(self, *exc_info: object) -> None:
+        self.destroy_node()
 
     def __repr__(self) -> str:
         return f"<Node {self._full_name}>"

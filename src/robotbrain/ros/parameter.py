@@ -1,25 +1,36 @@
-"""Parameters (``rclpy.parameter``): values, types and the set a node has."""
+"""Parameters (``rclpy.parameter``): values, types, messages and files."""
 
 from __future__ import annotations
 
 import enum
 from array import array
-from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from robotbrain.ros.exceptions import (
-    InvalidParameterTypeException,
-    InvalidParameterValueException,
-    ParameterAlreadyDeclaredException,
-    ParameterNotDeclaredException,
-    ParameterUninitializedException,
-)
+from robotbrain.errors import InputError
 from robotbrain.ros.messages import message_class
+from robotbrain.ros.parameter_files import flatten, load_yaml, parse_value
 
-if TYPE_CHECKING:
-    from robotbrain.ros.node import Node
+PARAMETER_SEPARATOR_STRING = "."
+
+__all__ = [
+    "PARAMETER_SEPARATOR_STRING",
+    "Parameter",
+    "ParameterType",
+    "get_parameter_value",
+    "infer_type",
+    "parameter_dict_from_yaml_file",
+    "parameter_value_to_python",
+]
+
+
+class ParameterTypeError(TypeError, InputError):
+    """No parameter can hold this value."""
+
+    def __init__(self, what: str, *, given: object, expected: str, fix: str) -> None:
+        InputError.__init__(self, what, given=given, expected=expected, fix=fix)
 
 
 class ParameterType(enum.IntEnum):
@@ -35,6 +46,23 @@ class ParameterType(enum.IntEnum):
     INTEGER_ARRAY = 7
     DOUBLE_ARRAY = 8
     STRING_ARRAY = 9
+
+    @classmethod
+    def from_parameter_value(cls, parameter_value: Any) -> ParameterType:
+        """Return the type of a Python value.
+
+        Raises:
+            TypeError: no parameter can hold it.
+        """
+        return infer_type(parameter_value)
+
+    def check(self, parameter_value: Any) -> bool:
+        """Tell whether a Python value is of this type; an empty list is of every array type."""
+        try:
+            inferred = infer_type(parameter_value)
+        except TypeError:
+            return False
+        return inferred == self or (self >= ParameterType.BYTE_ARRAY and _is_empty_list(parameter_value))
 
 
 _FIELDS = {
@@ -63,27 +91,32 @@ _ARRAYS = {
 }
 
 
+def _is_empty_list(value: Any) -> bool:
+    return isinstance(value, (list, tuple, array, np.ndarray)) and not len(value)
+
+
 def infer_type(value: Any) -> ParameterType:
-    """Return the parameter type of a Python value.
+    """Return the parameter type of a Python value; an empty list counts as BYTE_ARRAY, as in rclpy.
 
     Raises:
-        InvalidParameterTypeException: no parameter can hold it.
+        TypeError: no parameter can hold it.
     """
     if value is None:
         return ParameterType.NOT_SET
-    if type(value) in _SCALARS:
-        return _SCALARS[type(value)]
+    for python_type, parameter_type in _SCALARS.items():
+        if isinstance(value, python_type):
+            return parameter_type
     if isinstance(value, (list, tuple, array, np.ndarray)):
         kinds = {type(item) for item in (value.tolist() if isinstance(value, np.ndarray) else value)}
         if not kinds:
             return ParameterType.BYTE_ARRAY
         if len(kinds) == 1 and (kind := kinds.pop()) in _ARRAYS:
             return _ARRAYS[kind]
-    raise InvalidParameterTypeException(
+    raise ParameterTypeError(
         "parameter value",
         given=value,
-        expected="bool, int, float, str or a list of one of these",
-        fix="Convert numpy scalars with .item(); mixed lists are not allowed.",
+        expected="bool, int, float, str, or a list of one of these (or of single bytes)",
+        fix="Convert it, e.g. with float(...) or list(...); mixed lists are not allowed.",
     )
 
 
@@ -96,23 +129,22 @@ class Parameter:
         value: the value.
 
     Raises:
-        InvalidParameterTypeException: value and type disagree.
+        InputError: value and type disagree.
+        TypeError: no parameter can hold the value.
     """
 
     Type = ParameterType
 
     def __init__(self, name: str, type_: ParameterType | None = None, value: Any = None) -> None:
-        inferred = infer_type(value)
         if type_ is None:
-            type_ = inferred
-        elif value is not None and inferred != type_ and not _empty_list_fits(value, type_):
-            raise InvalidParameterTypeException(
-                f"parameter {name}",
-                given=value,
-                expected=ParameterType(type_).name,
-                fix="A double parameter takes 1.0, not 1.",
+            type_ = infer_type(value)
+        elif not isinstance(type_, ParameterType):
+            raise TypeError(f"type must be an instance of {ParameterType!r}, got {type_!r}")
+        elif not type_.check(value):
+            raise InputError(
+                f"parameter {name}", given=value, expected=type_.name, fix="A double parameter takes 1.0, not 1."
             )
-        self._name, self._type, self._value = name, ParameterType(type_), value
+        self._name, self._type, self._value = name, type_, value
 
     @property
     def name(self) -> str:
@@ -132,7 +164,7 @@ class Parameter:
     def get_parameter_value(self) -> Any:
         """Return the value as ``rcl_interfaces/msg/ParameterValue``."""
         msg = message_class("rcl_interfaces/msg/ParameterValue")(type=int(self._type))
-        if self._type in _FIELDS:
+        if self._type in _FIELDS and self._value is not None:
             setattr(msg, _FIELDS[self._type], self._value)
         return msg
 
@@ -141,136 +173,67 @@ class Parameter:
         return message_class("rcl_interfaces/msg/Parameter")(name=self._name, value=self.get_parameter_value())
 
     @classmethod
-    def from_parameter_msg(cls, msg: Any) -> Parameter:
+    def from_parameter_msg(cls, param_msg: Any) -> Parameter:
         """Build from ``rcl_interfaces/msg/Parameter``."""
-        kind = ParameterType(msg.value.type)
-        value = getattr(msg.value, _FIELDS[kind]) if kind in _FIELDS else None
-        return cls(msg.name, kind, list(value) if isinstance(value, array) else value)
-
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, Parameter):
-            return NotImplemented
-        return (self._name, self._type, self._value) == (other._name, other._type, other._value)
-
-    __hash__ = None  # type: ignore[assignment]
+        kind = ParameterType(param_msg.value.type)
+        return cls(param_msg.name, kind, parameter_value_to_python(param_msg.value))
 
     def __repr__(self) -> str:
         return f"Parameter(name={self._name!r}, type_={self._type.name}, value={self._value!r})"
 
 
-def _empty_list_fits(value: Any, type_: ParameterType) -> bool:
-    return isinstance(value, (list, tuple)) and not value and type_ >= ParameterType.BYTE_ARRAY
+def parameter_value_to_python(parameter_value: Any) -> Any:
+    """Return what an ``rcl_interfaces/msg/ParameterValue`` holds; None when it is not set.
+
+    Raises:
+        RuntimeError: its type is none.
+    """
+    try:
+        kind = ParameterType(parameter_value.type)
+    except ValueError:
+        raise RuntimeError(f"unexpected parameter type {parameter_value.type}") from None
+    if kind == ParameterType.NOT_SET:
+        return None
+    value = getattr(parameter_value, _FIELDS[kind])
+    return list(value) if isinstance(value, (array, list)) else value
 
 
-class ParameterSet:
-    """The declared parameters of a node and the callbacks that may refuse a change."""
-
-    def __init__(self, node: Node, overrides: dict[str, Any], allow_undeclared: bool) -> None:
-        self._node, self._overrides, self._allow_undeclared = node, overrides, allow_undeclared
-        self._values: dict[str, Parameter] = {}
-        self._types: dict[str, ParameterType | None] = {}
-        self._read_only: set[str] = set()
-        self.callbacks: list[Callable[[list[Parameter]], Any]] = []
-
-    def declare(self, name: str, value: Any, descriptor: Any, ignore_override: bool) -> Parameter:
-        """Declare one parameter; see ``Node.declare_parameter``."""
-        if name in self._values:
-            raise ParameterAlreadyDeclaredException(
-                f"parameter {name}",
-                given="a second declaration",
-                expected=f"one per node ({self._node.get_name()})",
-                fix="Use set_parameters to change it, or has_parameter to ask.",
-            )
-        if isinstance(value, type):
-            value = _SCALARS.get(value, value)
-        declared_type: ParameterType | None = None
-        if isinstance(value, ParameterType):
-            declared_type, value = value, None
-        dynamic = bool(getattr(descriptor, "dynamic_typing", False))
-        original = infer_type(value)
-        if name in self._overrides and not ignore_override:
-            value = self._overrides[name]
-        expected = declared_type or (original if original != ParameterType.NOT_SET else None)
-        parameter = Parameter(name, expected if not dynamic and value is not None else None, value)
-        result = self._ask([parameter])
-        if not result.successful:
-            raise InvalidParameterValueException(
-                f"parameter {name}", given=value, expected=result.reason, fix="Choose another default."
-            )
-        self._values[name], self._types[name] = parameter, None if dynamic else expected
-        if getattr(descriptor, "read_only", False):
-            self._read_only.add(name)
-        return parameter
-
-    def undeclare(self, name: str) -> None:
-        """Remove a declared parameter."""
-        self.get(name)
-        del self._values[name], self._types[name]
-
-    def has(self, name: str) -> bool:
-        """Tell whether the parameter is declared."""
-        return name in self._values
-
-    def get(self, name: str) -> Parameter:
-        """Return the parameter; raise when it was not declared or has no value."""
-        if name not in self._values:
-            if self._allow_undeclared:
-                return Parameter(name)
-            raise ParameterNotDeclaredException(
-                "parameter",
-                given=name,
-                expected=f"a declared one of {self._node.get_name()}: {', '.join(self._values)}",
-                fix=f"Call declare_parameter({name!r}, default) first.",
-            )
-        parameter = self._values[name]
-        if parameter.type_ == ParameterType.NOT_SET and self._types[name] is not None:
-            raise ParameterUninitializedException(
-                f"parameter {name}", given="no value", expected="a value", fix="Set it or declare a default."
-            )
-        return parameter
-
-    def names(self) -> list[str]:
-        """Return the declared names in order of declaration."""
-        return list(self._values)
-
-    def set(self, parameters: Iterable[Parameter]) -> Any:
-        """Set all or none; return ``rcl_interfaces/msg/SetParametersResult``."""
-        parameters = list(parameters)
-        for parameter in parameters:
-            if reason := self._refusal(parameter):
-                return _result(False, reason)
-        result = self._ask(parameters)
-        if result.successful:
-            for parameter in parameters:
-                self._values[parameter.name] = parameter
-                self._types.setdefault(parameter.name, None)
-        return result
-
-    def _refusal(self, parameter: Parameter) -> str:
-        name = parameter.name
-        if name not in self._values:
-            if self._allow_undeclared:
-                return ""
-            raise ParameterNotDeclaredException(
-                "parameter",
-                given=name,
-                expected=f"a declared one of {self._node.get_name()}: {', '.join(self._values)}",
-                fix=f"Call declare_parameter({name!r}, default) first.",
-            )
-        if name in self._read_only:
-            return f"parameter {name} is read-only"
-        wanted = self._types[name]
-        if wanted is not None and parameter.type_ != wanted:
-            return f"parameter {name} has type {wanted.name}, not {parameter.type_.name}"
-        return ""
-
-    def _ask(self, parameters: list[Parameter]) -> Any:
-        for callback in self.callbacks:
-            result = callback(parameters)
-            if not result.successful:
-                return result
-        return _result(True, "")
+def get_parameter_value(string_value: str) -> Any:
+    """Return text, read as YAML, as an ``rcl_interfaces/msg/ParameterValue``."""
+    return Parameter("", value=parse_value(string_value)).get_parameter_value()
 
 
-def _result(successful: bool, reason: str) -> Any:
-    return message_class("rcl_interfaces/msg/SetParametersResult")(successful=successful, reason=reason)
+def parameter_dict_from_yaml_file(
+    parameter_file: str,
+    use_wildcard: bool = False,
+    target_nodes: list[str] | None = None,
+    namespace: str = "",
+) -> dict[str, Any]:
+    """Return the parameters of a YAML file as ``rcl_interfaces/msg/Parameter`` by name.
+
+    Args:
+        parameter_file: its path.
+        use_wildcard: take those under ``/**``, too.
+        target_nodes: names of the nodes to take parameters of; all nodes when omitted.
+        namespace: put before each name.
+
+    Raises:
+        RuntimeError: it has no such parameters.
+        InputError: it is no parameter file.
+    """
+    content = load_yaml(Path(parameter_file))
+    if not target_nodes:
+        target_nodes = [str(key) for key in content if key != "/**"]
+    chosen: dict[str, Any] = {}
+    for node in ["/**"] * use_wildcard + list(target_nodes):
+        absolute = node if node.startswith("/") else f"/{node}"
+        space, _, name = absolute.rpartition("/")
+        within = content.get(space)
+        candidates = [content.get(absolute), content.get(name) if not space else None]
+        candidates.append(within.get(name) if isinstance(within, dict) else None)
+        for found in candidates:
+            if isinstance(found, dict) and isinstance(found.get("ros__parameters"), dict):
+                chosen |= dict(flatten(found["ros__parameters"], namespace))
+    if not chosen:
+        raise RuntimeError("Param file does not contain any valid parameters")
+    return {name: Parameter(name, value=value).to_parameter_msg() for name, value in chosen.items()}

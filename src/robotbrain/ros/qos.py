@@ -1,60 +1,78 @@
-"""QoS profiles and their compatibility (``rclpy.qos``).
+"""QoS profiles (``rclpy.qos``).
 
-The kit acts on history, depth, reliability and durability. Deadline, lifespan and liveliness are stored.
+The kit acts on all policies: history and depth, reliability, durability, deadline, lifespan and liveliness.
 """
 
 from __future__ import annotations
 
 import enum
+from collections.abc import Sequence
 from typing import Any
 
 from robotbrain.ros.exceptions import InvalidQoSProfileException
+from robotbrain.ros.qos_compatibility import QoSCompatibility, incompatibility, mismatches, qos_check_compatible
+from robotbrain.ros.qos_policies import (
+    BEST_AVAILABLE_NS,
+    DeadlineBestAvailable,
+    DurabilityPolicy,
+    HistoryPolicy,
+    LivelinessLeaseDurationeBestAvailable,
+    LivelinessPolicy,
+    QoSDurabilityPolicy,
+    QoSHistoryPolicy,
+    QoSLivelinessPolicy,
+    QoSPolicyEnum,
+    QoSPolicyKind,
+    QoSReliabilityPolicy,
+    ReliabilityPolicy,
+    limit_ns,
+    qos_policy_name_from_kind,
+)
 from robotbrain.ros.time import Duration
 
+__all__ = [
+    "DeadlineBestAvailable",
+    "DurabilityPolicy",
+    "Duration",
+    "HistoryPolicy",
+    "InvalidQoSProfileException",
+    "LivelinessLeaseDurationeBestAvailable",
+    "LivelinessPolicy",
+    "QoSCompatibility",
+    "QoSDurabilityPolicy",
+    "QoSHistoryPolicy",
+    "QoSLivelinessPolicy",
+    "QoSPolicyEnum",
+    "QoSPolicyKind",
+    "QoSPresetProfiles",
+    "QoSProfile",
+    "QoSReliabilityPolicy",
+    "ReliabilityPolicy",
+    "as_profile",
+    "best_available",
+    "incompatibility",
+    "limit_ns",
+    "mismatches",
+    "qos_check_compatible",
+    "qos_policy_name_from_kind",
+    "qos_profile_action_status_default",
+    "qos_profile_best_available",
+    "qos_profile_default",
+    "qos_profile_parameter_events",
+    "qos_profile_parameters",
+    "qos_profile_rosout_default",
+    "qos_profile_sensor_data",
+    "qos_profile_services_default",
+    "qos_profile_system_default",
+    "qos_profile_unknown",
+]
 
-class HistoryPolicy(enum.IntEnum):
-    """How many messages wait for a busy reader."""
-
-    SYSTEM_DEFAULT = 0
-    KEEP_LAST = 1
-    KEEP_ALL = 2
-    UNKNOWN = 3
-
-
-class ReliabilityPolicy(enum.IntEnum):
-    """Whether delivery is guaranteed."""
-
-    SYSTEM_DEFAULT = 0
-    RELIABLE = 1
-    BEST_EFFORT = 2
-    UNKNOWN = 3
-    BEST_AVAILABLE = 4
-
-
-class DurabilityPolicy(enum.IntEnum):
-    """Whether late subscribers get earlier messages."""
-
-    SYSTEM_DEFAULT = 0
-    TRANSIENT_LOCAL = 1
-    VOLATILE = 2
-    UNKNOWN = 3
-    BEST_AVAILABLE = 4
-
-
-class LivelinessPolicy(enum.IntEnum):
-    """How a publisher shows that it is alive (stored only)."""
-
-    SYSTEM_DEFAULT = 0
-    AUTOMATIC = 1
-    MANUAL_BY_TOPIC = 3
-    UNKNOWN = 4
-    BEST_AVAILABLE = 5
-
-
-QoSHistoryPolicy = HistoryPolicy
-QoSReliabilityPolicy = ReliabilityPolicy
-QoSDurabilityPolicy = DurabilityPolicy
-QoSLivelinessPolicy = LivelinessPolicy
+_POLICIES: dict[str, type[enum.IntEnum]] = {
+    "history": HistoryPolicy,
+    "reliability": ReliabilityPolicy,
+    "durability": DurabilityPolicy,
+    "liveliness": LivelinessPolicy,
+}
 
 
 class QoSProfile:
@@ -65,51 +83,80 @@ class QoSProfile:
         depth: messages kept, >= 1 with KEEP_LAST.
         reliability: RELIABLE (default) or BEST_EFFORT.
         durability: VOLATILE (default) or TRANSIENT_LOCAL.
-        deadline: stored.
-        lifespan: stored.
-        liveliness: stored.
-        liveliness_lease_duration: stored.
+        lifespan: after which a message is no longer delivered; zero: no limit.
+        deadline: longest time between two messages; zero: no limit.
+        liveliness: AUTOMATIC (default) or MANUAL_BY_TOPIC.
+        liveliness_lease_duration: longest time without a sign of life; zero: no limit.
         avoid_ros_namespace_conventions: stored.
 
     Raises:
-        InvalidQoSProfileException: KEEP_LAST without a depth, or a negative depth.
+        InvalidQoSProfileException: KEEP_LAST without a depth, a negative depth, or a value of another type.
     """
+
+    history: HistoryPolicy
+    depth: int
+    reliability: ReliabilityPolicy
+    durability: DurabilityPolicy
+    lifespan: Duration
+    deadline: Duration
+    liveliness: LivelinessPolicy
+    liveliness_lease_duration: Duration
+    avoid_ros_namespace_conventions: bool
 
     def __init__(
         self,
-        *,
-        history: HistoryPolicy | None = None,
+        history: HistoryPolicy | int | None = None,
         depth: int | None = None,
-        reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE,
-        durability: DurabilityPolicy = DurabilityPolicy.VOLATILE,
-        deadline: Duration | None = None,
+        reliability: ReliabilityPolicy | int | None = None,
+        durability: DurabilityPolicy | int | None = None,
         lifespan: Duration | None = None,
-        liveliness: LivelinessPolicy = LivelinessPolicy.SYSTEM_DEFAULT,
+        deadline: Duration | None = None,
+        liveliness: LivelinessPolicy | int | None = None,
         liveliness_lease_duration: Duration | None = None,
-        avoid_ros_namespace_conventions: bool = False,
+        avoid_ros_namespace_conventions: bool | None = None,
     ) -> None:
         if history is None and depth is None:
             raise InvalidQoSProfileException(
                 "QoSProfile", given=None, expected="history and/or depth", fix="Write QoSProfile(depth=10)."
             )
-        history = HistoryPolicy.KEEP_LAST if history is None else HistoryPolicy(history)
-        if depth is None and history == HistoryPolicy.KEEP_LAST:
+        self.history = HistoryPolicy.KEEP_LAST if history is None else history  # type: ignore[assignment]
+        if depth is None and self.history == HistoryPolicy.KEEP_LAST:
             raise InvalidQoSProfileException(
                 "QoSProfile",
                 given="KEEP_LAST without depth",
                 expected="a depth >= 1",
                 fix="Write QoSProfile(history=KEEP_LAST, depth=10).",
             )
-        if depth is not None and (not isinstance(depth, int) or isinstance(depth, bool) or depth < 0):
+        self.depth = 10 if depth is None else depth
+        self.reliability = ReliabilityPolicy.RELIABLE if reliability is None else reliability  # type: ignore[assignment]
+        self.durability = DurabilityPolicy.VOLATILE if durability is None else durability  # type: ignore[assignment]
+        self.lifespan = Duration() if lifespan is None else lifespan
+        self.deadline = Duration() if deadline is None else deadline
+        self.liveliness = LivelinessPolicy.SYSTEM_DEFAULT if liveliness is None else liveliness  # type: ignore[assignment]
+        self.liveliness_lease_duration = Duration() if liveliness_lease_duration is None else liveliness_lease_duration
+        self.avoid_ros_namespace_conventions = bool(avoid_ros_namespace_conventions)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        policy = _POLICIES.get(name)
+        problem = ""
+        if policy is not None:
+            try:
+                value = policy(value)
+            except (ValueError, TypeError):
+                problem = "one of " + ", ".join(policy.__members__)
+        elif name == "depth":
+            if not isinstance(value, int) or isinstance(value, bool) or value < 0:
+                problem = "an integer >= 0"
+        elif name in ("lifespan", "deadline", "liveliness_lease_duration"):
+            if not isinstance(value, Duration):
+                problem = "a Duration"
+        elif name not in QoSProfile.__annotations__:
+            raise AttributeError(f"QoSProfile has no {name!r}; it has: {', '.join(QoSProfile.__annotations__)}")
+        if problem:
             raise InvalidQoSProfileException(
-                "QoSProfile.depth", given=depth, expected="an integer >= 0", fix="10 is the usual depth."
+                f"QoSProfile.{name}", given=value, expected=problem, fix="Import the policies from rclpy.qos."
             )
-        self.history, self.depth = history, 0 if depth is None else depth
-        self.reliability, self.durability = ReliabilityPolicy(reliability), DurabilityPolicy(durability)
-        self.deadline, self.lifespan = deadline or Duration(), lifespan or Duration()
-        self.liveliness = LivelinessPolicy(liveliness)
-        self.liveliness_lease_duration = liveliness_lease_duration or Duration()
-        self.avoid_ros_namespace_conventions = avoid_ros_namespace_conventions
+        object.__setattr__(self, name, value)
 
     @property
     def queue_limit(self) -> int | None:
@@ -121,13 +168,38 @@ class QoSProfile:
 
     __hash__ = None  # type: ignore[assignment]
 
-    def __repr__(self) -> str:
+    def __str__(self) -> str:
+        shown = {name: getattr(self, name) for name in QoSProfile.__annotations__}
         return (
-            f"QoSProfile(history={self.history.name}, depth={self.depth}, reliability={self.reliability.name}, "
-            f"durability={self.durability.name})"
+            "QoSProfile("
+            + ", ".join(f"{name}={int(v) if isinstance(v, enum.IntEnum) else v}" for name, v in shown.items())
+            + ")"
         )
 
+    def __repr__(self) -> str:
+        limits = [
+            f"{name}={getattr(self, name).nanoseconds * 1e-9:g} s"
+            for name in ("lifespan", "deadline", "liveliness_lease_duration")
+            if limit_ns(getattr(self, name)) is not None
+        ]
+        return ", ".join(
+            [
+                f"QoSProfile(history={self.history.name}",
+                f"depth={self.depth}",
+                f"reliability={self.reliability.name}",
+                f"durability={self.durability.name}",
+                *limits,
+            ]
+        ) + (")" if self.liveliness != LivelinessPolicy.MANUAL_BY_TOPIC else ", liveliness=MANUAL_BY_TOPIC)")
 
+
+qos_profile_unknown = QoSProfile(
+    history=HistoryPolicy.UNKNOWN,
+    depth=0,
+    reliability=ReliabilityPolicy.UNKNOWN,
+    durability=DurabilityPolicy.UNKNOWN,
+    liveliness=LivelinessPolicy.UNKNOWN,
+)
 qos_profile_default = QoSProfile(depth=10)
 qos_profile_system_default = QoSProfile(
     history=HistoryPolicy.SYSTEM_DEFAULT,
@@ -139,38 +211,43 @@ qos_profile_sensor_data = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST
 qos_profile_services_default = QoSProfile(depth=10)
 qos_profile_parameters = QoSProfile(depth=1000)
 qos_profile_parameter_events = QoSProfile(depth=1000)
+qos_profile_action_status_default = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+qos_profile_rosout_default = QoSProfile(
+    depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL, lifespan=Duration(seconds=10)
+)
 qos_profile_best_available = QoSProfile(
     depth=10,
     reliability=ReliabilityPolicy.BEST_AVAILABLE,
     durability=DurabilityPolicy.BEST_AVAILABLE,
+    deadline=DeadlineBestAvailable,
     liveliness=LivelinessPolicy.BEST_AVAILABLE,
+    liveliness_lease_duration=LivelinessLeaseDurationeBestAvailable,
 )
 
 
 class QoSPresetProfiles(enum.Enum):
-    """The presets by name."""
+    """The presets by name; ``.value`` is the :class:`QoSProfile`."""
 
-    SYSTEM_DEFAULT = "system_default"
-    SENSOR_DATA = "sensor_data"
-    SERVICES_DEFAULT = "services_default"
-    PARAMETERS = "parameters"
-    DEFAULT = "default"
-
-    @property
-    def value(self) -> Any:
-        """The :class:`QoSProfile` of this preset."""
-        return {
-            "system_default": qos_profile_system_default,
-            "sensor_data": qos_profile_sensor_data,
-            "services_default": qos_profile_services_default,
-            "parameters": qos_profile_parameters,
-            "default": qos_profile_default,
-        }[self._value_]
+    UNKNOWN = qos_profile_unknown
+    DEFAULT = qos_profile_default
+    SYSTEM_DEFAULT = qos_profile_system_default
+    SENSOR_DATA = qos_profile_sensor_data
+    SERVICES_DEFAULT = qos_profile_services_default
+    PARAMETERS = qos_profile_parameters
+    PARAMETER_EVENTS = qos_profile_parameter_events
+    ACTION_STATUS_DEFAULT = qos_profile_action_status_default
+    BEST_AVAILABLE = qos_profile_best_available
+    ROSOUT_DEFAULT = qos_profile_rosout_default
 
     @classmethod
-    def get_from_short_key(cls, name: str) -> Any:
+    def short_keys(cls) -> list[str]:
+        """Return the names in lower case."""
+        return [name.lower() for name in cls.__members__]
+
+    @classmethod
+    def get_from_short_key(cls, name: str) -> QoSProfile:
         """Return the profile of a short key such as ``"sensor_data"``."""
-        return cls(name.lower()).value
+        return cls[name.upper()].value
 
 
 def as_profile(qos: Any) -> QoSProfile:
@@ -188,13 +265,34 @@ def as_profile(qos: Any) -> QoSProfile:
     )
 
 
-def incompatibility(offered: QoSProfile, requested: QoSProfile) -> str:
-    """Return why a publisher's offer does not satisfy a subscription's request, or ``""`` when it does.
+def best_available(qos: QoSProfile, others: Sequence[QoSProfile], *, offers: bool) -> QoSProfile:
+    """Return ``qos`` with every BEST_AVAILABLE replaced by what goes with the endpoints that are there now.
 
-    Rule of DDS "requested versus offered" (OMG DDS 1.4, 2.2.3).
+    A subscription asks for the most that all publishers offer; a publisher offers the most there is.
+
+    Args:
+        qos: of the endpoint that is being made; left as it is.
+        others: of the endpoints on the other side of the topic.
+        offers: whether a publisher is being made.
     """
-    if offered.reliability == ReliabilityPolicy.BEST_EFFORT and requested.reliability == ReliabilityPolicy.RELIABLE:
-        return "reliability: the publisher is BEST_EFFORT, the subscription asks for RELIABLE"
-    if offered.durability == DurabilityPolicy.VOLATILE and requested.durability == DurabilityPolicy.TRANSIENT_LOCAL:
-        return "durability: the publisher is VOLATILE, the subscription asks for TRANSIENT_LOCAL"
-    return ""
+    result = QoSProfile(**qos.__dict__)
+    if qos.reliability == ReliabilityPolicy.BEST_AVAILABLE:
+        reliable = offers or all(other.reliability == ReliabilityPolicy.RELIABLE for other in others)
+        result.reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+    if qos.durability == DurabilityPolicy.BEST_AVAILABLE:
+        lasting = offers or all(other.durability == DurabilityPolicy.TRANSIENT_LOCAL for other in others)
+        result.durability = DurabilityPolicy.TRANSIENT_LOCAL if lasting else DurabilityPolicy.VOLATILE
+    if qos.liveliness == LivelinessPolicy.BEST_AVAILABLE:
+        manual = [other.liveliness == LivelinessPolicy.MANUAL_BY_TOPIC for other in others]
+        chosen = any(manual) if offers else bool(manual) and all(manual)
+        result.liveliness = LivelinessPolicy.MANUAL_BY_TOPIC if chosen else LivelinessPolicy.AUTOMATIC
+    for name in ("deadline", "liveliness_lease_duration"):
+        if getattr(qos, name).nanoseconds == BEST_AVAILABLE_NS:
+            limits = [limit_ns(getattr(other, name)) for other in others]
+            known = [limit for limit in limits if limit is not None]
+            if offers:
+                best = min(known, default=None)
+            else:
+                best = max(known) if known and len(known) == len(limits) else None
+            setattr(result, name, Duration(nanoseconds=best or 0))
+    return result

@@ -12,6 +12,10 @@ from robotbrain.files import write_bytes
 from robotbrain.ros.context import SimContext
 
 
+SYSTEM = frozenset({"/parameter_events", "/rosout"})
+"""Topics on which nodes publish of themselves, when somebody listens."""
+
+
 class DecisionLog:
     """Everything published on a context, in order: time, topic, type, publisher and CDR bytes.
 
@@ -20,7 +24,8 @@ class DecisionLog:
 
     Args:
         context: the simulation to record.
-        topics: record these only (absolute names); all when omitted.
+        topics: record these only (absolute names); all when omitted, but those in ``SYSTEM``: they depend on who
+            listens.
 
     Usable as a context manager; recording ends with :meth:`close`.
     """
@@ -34,7 +39,7 @@ class DecisionLog:
         self._open = True
 
     def _take(self, time_ns: int, topic: str, typename: str, node: str, data: bytes) -> None:
-        if self._topics is not None and topic not in self._topics:
+        if topic in SYSTEM if self._topics is None else topic not in self._topics:
             return
         parts = [struct.pack("<Q", time_ns)]
         for part in (topic.encode(), typename.encode(), node.encode(), data):

@@ -13,6 +13,7 @@ from robotbrain.ros.entity import Entity
 from robotbrain.ros.exceptions import ReentrancyError, SimulationDeadlockError, TypeConflictError
 from robotbrain.ros.executors import Work
 from robotbrain.ros.qos import QoSProfile
+from robotbrain.ros.spinning import spin_while
 from robotbrain.ros.task import Future
 
 if TYPE_CHECKING:
@@ -20,12 +21,45 @@ if TYPE_CHECKING:
 
 _MAX_FAILED_WAITS = 100
 
+Request = tuple["Client", bytes, Future]
+"""A request on its way: who asks, CDR, and where the response goes."""
+
+
+class Patience:
+    """Waits for a server without waiting forever for what cannot come."""
+
+    def __init__(self, node: Node) -> None:
+        self._node, self._failed = node, 0
+
+    def wait(self, ready: Callable[[], bool], timeout_sec: float | None, what: str, never: Callable[[], str]) -> bool:
+        """Return whether ``ready()``, letting simulated time pass until it is; inside a callback answer at once.
+
+        Raises:
+            SimulationDeadlockError: with ``never()`` as its text: waited without limit, or 100 times in vain.
+        """
+        if not ready() and self._node.context.running is None:
+            try:
+                spin_while(self._node.context, lambda: not ready(), timeout_sec, what)
+            except SimulationDeadlockError:
+                raise SimulationDeadlockError(never()) from None
+        if ready():
+            self._failed = 0
+            return True
+        self._failed += 1
+        if self._failed >= _MAX_FAILED_WAITS:
+            raise SimulationDeadlockError(never())
+        return False
+
+
+class ServiceTypeError(InputError, RuntimeError):
+    """Something else than a service class was given (genuine rclpy raises RuntimeError)."""
+
 
 def srv_name_of(srv_type: Any) -> str:
     """Return the ROS name of a service class; raise InputError when it is none."""
     name = getattr(srv_type, "__srvtype__", None)
     if not isinstance(name, str):
-        raise InputError(
+        raise ServiceTypeError(
             "service type",
             given=srv_type,
             expected="a service class such as std_srvs.srv.Trigger",
@@ -67,7 +101,7 @@ class Service(Entity):
         """Absolute service name."""
         return self.srv_name
 
-    def receive(self, request: tuple[Client, bytes, Future], message_id: int) -> None:
+    def receive(self, request: Request, message_id: int) -> None:
         """Queue a request that has arrived; a full queue loses its oldest, whose future never completes."""
         work = Work(self, request, self.node.context.now_ns, message_id)
         limit = self.qos_profile.queue_limit
@@ -88,19 +122,27 @@ class Service(Entity):
         return self.callback(cdr.from_cdr(work.payload[1], self.srv_type.Request), self.srv_type.Response())
 
     def complete(self, work: Work, result: Any) -> None:
-        """Send the response.
+        """Send the response that the callback returned."""
+        self.send_response(result, work.payload)
+
+    def send_response(self, response: Any, header: Request) -> None:
+        """Answer a request.
+
+        Args:
+            response: a Response of this service.
+            header: which request it answers.
 
         Raises:
-            TypeError: the callback returned something else than a response.
+            TypeError: not a response of this service.
         """
-        if not isinstance(result, self.srv_type.Response):
+        if not isinstance(response, self.srv_type.Response):
             raise TypeError(
-                f"the callback of service {self.srv_name} returned {type(result).__name__}; it must return the "
+                f"the callback of service {self.srv_name} returned {type(response).__name__}; it must return the "
                 f"{self.typename} Response it was given (is 'return response' missing?)"
             )
-        client, _, future = work.payload
+        client, _, future = header
         context = self.node.context
-        context.release(client.deliver, (cdr.to_cdr(result), future, context.new_message_id(), self.node))
+        context.release(client.deliver, (cdr.to_cdr(response), future, context.new_message_id(), self.node))
 
     def destroy(self) -> None:
         """Stop serving."""
@@ -109,6 +151,20 @@ class Service(Entity):
             for work in self._queue:
                 work.alive = False
             super().destroy()
+
+
+class DeferredService(Service):
+    """A service whose callback does not return the response: ``callback(request, header)`` sees to it that
+    :meth:`Service.send_response` is called with that header, sooner or later."""
+
+    def execute(self, work: Work) -> Any:
+        """Decode the request and call back."""
+        self._queue.remove(work)
+        assert self.callback is not None
+        return self.callback(cdr.from_cdr(work.payload[1], self.srv_type.Request), work.payload)
+
+    def complete(self, work: Work, result: Any) -> None:
+        """Do nothing: the response comes by itself."""
 
 
 class Client(Entity):
@@ -122,7 +178,8 @@ class Client(Entity):
         super().__init__(node, srv_name, None, group)
         self.srv_type, self.srv_name, self.qos_profile = srv_type, srv_name, qos
         self.typename = srv_name_of(srv_type)
-        self._failed_waits = 0
+        self._patience = Patience(node)
+        self._removed: list[Future] = []
 
     @property
     def service_name(self) -> str:
@@ -185,7 +242,7 @@ class Client(Entity):
     def execute(self, work: Work) -> Any:
         """Complete the future; its done callbacks run on this node's executor."""
         data, future = work.payload
-        if not future.done():
+        if future._pending() and future not in self._removed:
             future.set_result(cdr.from_cdr(data, self.srv_type.Response))
 
     def call(self, request: Any, timeout_sec: float | None = None) -> Any:
@@ -211,8 +268,8 @@ class Client(Entity):
         return future.result()
 
     def remove_pending_request(self, future: Future) -> None:
-        """Forget a call: cancel its future."""
-        future.cancel()
+        """Forget a call: its future will not be completed."""
+        self._removed.append(future)
 
     def _server(self) -> Service | None:
         server = self.node.context.services.get(self.srv_name)
@@ -237,24 +294,7 @@ class Client(Entity):
         Raises:
             SimulationDeadlockError: waited without limit, or 100 times in vain.
         """
-        if self.service_is_ready():
-            self._failed_waits = 0
-            return True
-        context = self.node.context
-        if context.running is None:
-            executor = self.node.executor
-            if executor is not None:
-                try:
-                    executor._spin_while(lambda: not self.service_is_ready(), timeout_sec, "wait_for_service")
-                except SimulationDeadlockError:
-                    raise SimulationDeadlockError(self._never()) from None
-            if self.service_is_ready():
-                self._failed_waits = 0
-                return True
-        self._failed_waits += 1
-        if self._failed_waits >= _MAX_FAILED_WAITS:
-            raise SimulationDeadlockError(self._never())
-        return False
+        return self._patience.wait(self.service_is_ready, timeout_sec, "wait_for_service", self._never)
 
     def _never(self) -> str:
         return (

@@ -13,29 +13,49 @@ import sys
 import types
 from collections.abc import Sequence
 
+from robotbrain.ros.tf2 import TF2_MODULES
+
 RCLPY_MODULES: dict[str, str] = {
     "rclpy": "api",
+    "rclpy.action": "action",
+    "rclpy.action.client": "action.client",
+    "rclpy.action.graph": "action.graph",
+    "rclpy.action.server": "action.server",
     "rclpy.callback_groups": "callback_groups",
     "rclpy.client": "services",
     "rclpy.clock": "clock",
     "rclpy.clock_type": "time",
     "rclpy.context": "context",
     "rclpy.duration": "time",
+    "rclpy.event_handler": "event_handler",
     "rclpy.exceptions": "exceptions",
     "rclpy.executors": "executors",
+    "rclpy.guard_condition": "guard_condition",
     "rclpy.logging": "logging",
     "rclpy.node": "node",
     "rclpy.parameter": "parameter",
+    "rclpy.parameter_client": "parameter_client",
+    "rclpy.parameter_event_handler": "parameter_event_handler",
+    "rclpy.parameter_service": "parameter_service",
     "rclpy.publisher": "topics",
     "rclpy.qos": "qos",
+    "rclpy.qos_event": "event_handler",
+    "rclpy.qos_overriding_options": "qos_overriding_options",
     "rclpy.serialization": "serialization",
     "rclpy.service": "services",
+    "rclpy.signals": "signals",
     "rclpy.subscription": "topics",
     "rclpy.task": "task",
     "rclpy.time": "time",
     "rclpy.timer": "timer",
+    "rclpy.topic_endpoint_info": "endpoint_info",
+    "rclpy.utilities": "utilities",
+    "rclpy.wait_for_message": "wait_for_message",
 }
 """Module of rclpy -> module of ``robotbrain.ros`` whose public names it shows."""
+
+MODULES: dict[str, str] = {**RCLPY_MODULES, **TF2_MODULES}
+"""All modules that are shown under another name."""
 
 _EXTRA_NAMES: dict[str, dict[str, str]] = {
     "rclpy.clock": {"ClockType": "time"},
@@ -43,7 +63,6 @@ _EXTRA_NAMES: dict[str, dict[str, str]] = {
     "rclpy.executors": {"ExternalShutdownException": "executors"},
     "rclpy.logging": {},
     "rclpy.node": {"Parameter": "parameter"},
-    "rclpy.task": {"Task": "task:Future"},
     "rclpy": {"Context": "context:SimContext", "Node": "node", "Parameter": "parameter"},
 }
 
@@ -55,10 +74,10 @@ class KitFinder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         self, fullname: str, path: Sequence[str] | None, target: types.ModuleType | None = None
     ) -> importlib.machinery.ModuleSpec | None:
         """Return a spec for a module the kit stands in for, else None."""
-        if fullname in RCLPY_MODULES:
-            return importlib.machinery.ModuleSpec(fullname, self, is_package=fullname == "rclpy")
+        if fullname in MODULES:
+            return importlib.machinery.ModuleSpec(fullname, self, is_package=_is_package(fullname))
         package, _, kind = fullname.partition(".")
-        if kind not in ("", "msg", "srv") or not package.endswith(("_msgs", "_srvs", "_interfaces", "_common")):
+        if kind not in ("", "msg", "srv", "action") or not package.endswith(("_msgs", "_srvs", "_interfaces", "_common")):
             return None
         from robotbrain.ros.typedefs import packages, typenames
 
@@ -77,14 +96,18 @@ class KitFinder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
     def exec_module(self, module: types.ModuleType) -> None:
         """Fill the module; message classes are made when first asked for."""
         name = module.__name__
-        if name in RCLPY_MODULES:
+        if name in MODULES:
             _fill_rclpy(module)
         elif "." in name:
             _fill_interfaces(module)
 
 
+def _is_package(name: str) -> bool:
+    return any(other.startswith(name + ".") for other in MODULES)
+
+
 def _fill_rclpy(module: types.ModuleType) -> None:
-    source = importlib.import_module(f"robotbrain.ros.{RCLPY_MODULES[module.__name__]}")
+    source = importlib.import_module(f"robotbrain.ros.{MODULES[module.__name__]}")
     public = getattr(source, "__all__", None) or [key for key in vars(source) if not key.startswith("_")]
     for key in public:
         value = getattr(source, key)
@@ -93,34 +116,39 @@ def _fill_rclpy(module: types.ModuleType) -> None:
     for key, where in _EXTRA_NAMES.get(module.__name__, {}).items():
         file, _, other = where.partition(":")
         setattr(module, key, getattr(importlib.import_module(f"robotbrain.ros.{file}"), other or key))
-    if module.__name__ == "rclpy":
-        # Genuine rclpy imports these submodules itself, so that rclpy.qos.QoSProfile works after `import rclpy`.
-        for submodule in RCLPY_MODULES:
-            if submodule != "rclpy":
+    if "." not in module.__name__:
+        # Genuine packages import these submodules themselves, so that rclpy.qos.QoSProfile works after `import rclpy`.
+        for submodule in MODULES:
+            if submodule.startswith(module.__name__ + "."):
                 importlib.import_module(submodule)
 
 
 def _fill_interfaces(module: types.ModuleType) -> None:
-    from robotbrain.ros.messages import is_service, message_class, service_class
+    from robotbrain.ros.messages import action_class, is_action, is_service, message_class, service_class
     from robotbrain.ros.typedefs import typenames
 
     prefix = module.__name__.replace(".", "/") + "/"
     names = sorted(name.removeprefix(prefix) for name in typenames() if name.startswith(prefix))
     services = sorted({name.removesuffix("_Request") for name in names if name.endswith("_Request")})
+    actions = sorted({name.removesuffix("_Goal") for name in names if name.endswith("_Goal")})
 
     def load(key: str) -> object:
         if key in names:
             value: object = message_class(prefix + key)
+        elif key in actions and is_action(prefix + key):
+            value = action_class(prefix + key)
         elif key in services and is_service(prefix + key):
             value = service_class(prefix + key)
         else:
-            raise AttributeError(f"{module.__name__} has no {key!r}; it has: {', '.join(services or names)}")
+            raise AttributeError(
+                f"{module.__name__} has no {key!r}; it has: {', '.join(actions or services or names)}"
+            )
         setattr(module, key, value)
         return value
 
     module.__getattr__ = load  # type: ignore[method-assign]
-    module.__all__ = [*services, *names]  # type: ignore[attr-defined]
-    module.__dir__ = lambda: [*services, *names]  # type: ignore[method-assign]
+    module.__all__ = [*actions, *services, *names]  # type: ignore[attr-defined]
+    module.__dir__ = lambda: [*actions, *services, *names]  # type: ignore[method-assign]
 
 
 _finder = KitFinder()

@@ -22,6 +22,9 @@ SRV_DEFINITIONS: dict[str, str] = {
     "visualization_msgs/srv/GetInteractiveMarkers": (
         "---\nuint64 sequence_number\nvisualization_msgs/InteractiveMarker[] markers"
     ),
+    "example_interfaces/srv/AddTwoInts": "int64 a\nint64 b\n---\nint64 sum",
+    "example_interfaces/srv/SetBool": "bool data\n---\nbool success\nstring message",
+    "example_interfaces/srv/Trigger": "---\nbool success\nstring message",
     "std_srvs/srv/Empty": "---",
     "std_srvs/srv/SetBool": "bool data\n---\nbool success\nstring message",
     "std_srvs/srv/Trigger": "---\nbool success\nstring message",

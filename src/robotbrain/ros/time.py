@@ -23,8 +23,23 @@ class ClockType(enum.IntEnum):
 
 
 def seconds_to_ns(seconds: float) -> int:
-    """Return seconds as whole nanoseconds, rounded to nearest (0.1 s is 100 000 000 ns)."""
-    return round(seconds * NS_PER_S)
+    """Return seconds as whole nanoseconds, cut off as genuine rclpy does (0.1 s is 100 000 000 ns).
+
+    Raises:
+        InputError: not a number.
+    """
+    try:
+        return int(seconds * NS_PER_S)
+    except TypeError:
+        raise InputError(
+            "seconds", given=seconds, expected="a number", fix="Text is converted with float(...)."
+        ) from None
+
+
+def _message_ns(msg: Any, typename: str) -> int:
+    if getattr(msg, "__msgtype__", None) != typename:
+        raise TypeError(f"Must pass a {typename} object, got {getattr(msg, '__msgtype__', type(msg).__name__)}")
+    return int(msg.sec * NS_PER_S + msg.nanosec)
 
 
 @total_ordering
@@ -57,7 +72,7 @@ class Duration:
     @classmethod
     def from_msg(cls, msg: Any) -> Duration:
         """Build from a ``builtin_interfaces/msg/Duration``."""
-        return cls(nanoseconds=msg.sec * NS_PER_S + msg.nanosec)
+        return cls(nanoseconds=_message_ns(msg, "builtin_interfaces/msg/Duration"))
 
     def __add__(self, other: object) -> Any:
         if isinstance(other, Duration):
@@ -74,26 +89,16 @@ class Duration:
             return Duration(nanoseconds=round(self._ns * factor))
         return NotImplemented
 
-    __rmul__ = __mul__
-
-    def __truediv__(self, other: object) -> Any:
-        if isinstance(other, Duration):
-            return self._ns / other._ns
-        if isinstance(other, (int, float)):
-            return Duration(nanoseconds=round(self._ns / other))
-        return NotImplemented
-
-    def __neg__(self) -> Duration:
-        return Duration(nanoseconds=-self._ns)
-
     def __eq__(self, other: object) -> bool:
         return self._ns == other._ns if isinstance(other, Duration) else NotImplemented
 
     def __lt__(self, other: object) -> bool:
         return self._ns < other._ns if isinstance(other, Duration) else NotImplemented
 
-    def __hash__(self) -> int:
-        return hash(("Duration", self._ns))
+    __hash__ = None  # type: ignore[assignment]
+
+    def __str__(self) -> str:
+        return f"{self._ns} nanoseconds"
 
     def __repr__(self) -> str:
         return f"Duration(nanoseconds={self._ns})"
@@ -155,7 +160,7 @@ class Time:
     @classmethod
     def from_msg(cls, msg: Any, clock_type: ClockType = ClockType.ROS_TIME) -> Time:
         """Build from a ``builtin_interfaces/msg/Time``."""
-        return cls(nanoseconds=msg.sec * NS_PER_S + msg.nanosec, clock_type=clock_type)
+        return cls(nanoseconds=_message_ns(msg, "builtin_interfaces/msg/Time"), clock_type=clock_type)
 
     def __add__(self, other: object) -> Any:
         if isinstance(other, Duration):
@@ -191,8 +196,7 @@ class Time:
             return self._ns < other._ns
         return NotImplemented
 
-    def __hash__(self) -> int:
-        return hash((self._clock_type, self._ns))
+    __hash__ = None  # type: ignore[assignment]
 
     def __repr__(self) -> str:
         return f"Time(nanoseconds={self._ns}, clock_type={self._clock_type.name})"

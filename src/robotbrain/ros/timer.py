@@ -2,17 +2,53 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from robotbrain.errors import InputError
 from robotbrain.ros.callback_groups import CallbackGroup
+from robotbrain.ros.clock import Clock
 from robotbrain.ros.entity import Entity
 from robotbrain.ros.executors import Work
-from robotbrain.ros.time import seconds_to_ns
+from robotbrain.ros.rate import Rate
+from robotbrain.ros.time import ClockType, Time, seconds_to_ns
+
+__all__ = ["Rate", "Timer", "TimerInfo"]
 
 if TYPE_CHECKING:
     from robotbrain.ros.node import Node
+
+
+class TimerInfo:
+    """When a timer's call was due and when it came; given to callbacks with a parameter annotated ``TimerInfo``.
+
+    Args:
+        expected_call_time, actual_call_time: ns.
+        clock_type: of these times.
+    """
+
+    def __init__(
+        self,
+        *,
+        expected_call_time: int = 0,
+        actual_call_time: int = 0,
+        clock_type: ClockType = ClockType.SYSTEM_TIME,
+    ) -> None:
+        if expected_call_time < 0 or actual_call_time < 0:
+            raise ValueError("call time values must not be negative")
+        self._expected = Time(nanoseconds=expected_call_time, clock_type=clock_type)
+        self._actual = Time(nanoseconds=actual_call_time, clock_type=clock_type)
+
+    @property
+    def expected_call_time(self) -> Time:
+        """When the call was due."""
+        return self._expected
+
+    @property
+    def actual_call_time(self) -> Time:
+        """When it came."""
+        return self._actual
 
 
 class Timer(Entity):
@@ -31,17 +67,35 @@ class Timer(Entity):
         callback: Callable[[], Any],
         group: CallbackGroup | None = None,
         autostart: bool = True,
+        clock: Clock | None = None,
     ) -> None:
         name = getattr(callback, "__name__", None) or "timer"
         super().__init__(node, name, callback, group)
-        self.timer_period_ns = period_sec_to_ns(period_sec)
+        self._clock = clock
+        self._period_ns = period_sec_to_ns(period_sec)
+        self._info = info_parameter(callback)
         self._canceled = not autostart
         self._epoch = 0
         self._pending: Work | None = None
         self._last_call_ns = node.context.now_ns
-        self._next_ns = node.context.now_ns + self.timer_period_ns
+        self._next_ns = node.context.now_ns + self._period_ns
         if autostart:
             self._arm()
+
+    @property
+    def clock(self) -> Clock:
+        """The clock it was made with: all of them tell simulated time."""
+        return self._clock or self.node.get_clock()
+
+    @property
+    def timer_period_ns(self) -> int:
+        """The period in ns; a new one counts from the next call on."""
+        return self._period_ns
+
+    @timer_period_ns.setter
+    def timer_period_ns(self, value: int) -> None:
+        period_sec_to_ns(value * 1e-9)
+        self._period_ns = int(value)
 
     def _arm(self) -> None:
         self._epoch += 1
@@ -56,14 +110,18 @@ class Timer(Entity):
     def execute(self, work: Work) -> Any:
         """Call back; the next due time is fixed before, as rcl does."""
         self._pending = None
-        now, period = self.node.context.now_ns, self.timer_period_ns
+        now, period = self.node.context.now_ns, self._period_ns
         self._last_call_ns = now
+        due = self._next_ns
         self._next_ns += period
         if self._next_ns < now:
             self._next_ns += -(-(now - self._next_ns) // period) * period
         self._arm()
         assert self.callback is not None
-        return self.callback()
+        if self._info is None:
+            return self.callback()
+        info = TimerInfo(expected_call_time=due, actual_call_time=now, clock_type=self.clock.clock_type)
+        return self.callback(**{self._info: info})
 
     def cancel(self) -> None:
         """Stop until :meth:`reset`."""
@@ -81,13 +139,19 @@ class Timer(Entity):
         self.check_usable()
         self._drop_pending()
         self._canceled = False
-        self._next_ns = self.node.context.now_ns + self.timer_period_ns
+        self._next_ns = self.node.context.now_ns + self._period_ns
         self._arm()
 
     def destroy(self) -> None:
         """Stop for good."""
         self._drop_pending()
         super().destroy()
+
+    def __enter__(self) -> Timer:
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        self.destroy()
 
     def is_canceled(self) -> bool:
         """Tell whether the timer is cancelled."""
@@ -104,6 +168,15 @@ class Timer(Entity):
     def time_until_next_call(self) -> int | None:
         """Return the ns until the next call is due, None when cancelled."""
         return None if self._canceled else self._next_ns - self.node.context.now_ns
+
+
+def info_parameter(callback: Callable[..., Any]) -> str | None:
+    """Return the name of the parameter that wants a :class:`TimerInfo`, or None."""
+    try:
+        parameters = inspect.signature(callback).parameters
+    except (TypeError, ValueError):
+        return None
+    return next((name for name, parameter in parameters.items() if parameter.annotation is TimerInfo), None)
 
 
 def period_sec_to_ns(period_sec: float) -> int:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from robotbrain.errors import InputError
+from robotbrain.ros.action_definitions import ACTION_DEFINITIONS, MSG_DEFINITIONS, struct_texts
 from robotbrain.ros.srv_definitions import FIELD_DEFAULTS, SRV_DEFINITIONS
 
 PLACEHOLDER = "structure_needs_at_least_one_member"
@@ -98,21 +99,28 @@ class StructDef:
 
 @functools.cache
 def typestore() -> Any:
-    """Return the rosbags store of ROS 2 Kilted with the kit's services added as ``*_Request``/``*_Response``."""
+    """Return the rosbags store of ROS 2 Kilted with the kit's services and actions added as the messages they are."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS2_KILTED)
+    texts = dict(MSG_DEFINITIONS)
     for name, text in SRV_DEFINITIONS.items():
         request, _, response = text.partition("---")
-        for part, suffix in ((request, "_Request"), (response, "_Response")):
-            body = part.strip() or f"uint8 {PLACEHOLDER}"
-            store.register({name + suffix: get_types_from_msg(body + "\n", "a/msg/B")["a/msg/B"]})
+        texts |= {name + "_Request": request, name + "_Response": response}
+    for name, text in ACTION_DEFINITIONS.items():
+        texts |= struct_texts(name, text)
+    store.register(
+        {
+            name: get_types_from_msg((text.strip() or f"uint8 {PLACEHOLDER}") + "\n", "a/msg/B")["a/msg/B"]
+            for name, text in texts.items()
+        }
+    )
     return store
 
 
 @functools.cache
 def typenames() -> frozenset[str]:
-    """Names of all struct types: messages and the request and response halves of services."""
+    """Names of all struct types: messages, and the parts of services and actions."""
     return frozenset(typestore().fielddefs)
 
 
@@ -136,7 +144,7 @@ def struct_def(typename: str) -> StructDef:
             "message type",
             given=typename,
             expected="a standard type such as 'geometry_msgs/msg/Twist'",
-            fix="Check the spelling; services are added in robotbrain.ros.srv_definitions.",
+            fix="Check the spelling; further types are added in robotbrain.ros.srv_definitions and action_definitions.",
         ) from None
     converted = tuple((name, _field_type(desc)) for name, desc in fields)
     defaults = {name: FIELD_DEFAULTS[typename, name] for name, _ in converted if (typename, name) in FIELD_DEFAULTS}

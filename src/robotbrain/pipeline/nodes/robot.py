@@ -23,7 +23,7 @@ CATCH_UP_NS = 500_000_000
 class RobotNode(Node):
     """Publishes the simulator's sensors and obeys ``cmd_vel``. The judge's ground truth is not within its reach.
 
-    The simulator keeps up with the node's clock, whose time at the simulator's zero is ``epoch_ns``: 0 in simulated time.
+    The simulator keeps up with the node's clock, which reads ``epoch_ns`` when the simulator is at zero.
 
     Args:
         sim: the robot in its world, at time zero.

@@ -98,7 +98,8 @@ class TwistLimiter:
         ramp = self.limits.ramp_s(self.v, self.w)
         # What is left after dt; less than a nanosecond of ramp is no motion.
         keep = max(0.0, 1.0 - dt / ramp) if ramp > 1e-9 else 0.0
-        self.v, self.w = self.v * keep, self.w * keep
+        # Adding zero turns a negative zero into a positive one.
+        self.v, self.w = self.v * keep + 0.0, self.w * keep + 0.0
         return self.v, self.w
 
 
