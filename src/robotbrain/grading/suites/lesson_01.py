@@ -69,6 +69,8 @@ def _traffic(student: Any) -> None:
 # ---------------------------------------------------------------- 2
 
 _FAR = 3.0
+Case = tuple[dict[float, float], bool, str]
+"""A scan, as {angle in degrees: range in m}, the right answer, and a hint."""
 
 
 def _warnings(student: Any, scans: Sequence[dict[float, float]]) -> list[bool]:
@@ -98,7 +100,7 @@ def _warnings(student: Any, scans: Sequence[dict[float, float]]) -> list[bool]:
     return heard
 
 
-def _expect_warnings(student: Any, cases: Sequence[tuple[dict[float, float], bool, str]]) -> None:
+def _expect_warnings(student: Any, cases: Sequence[Case]) -> None:
     heard = _warnings(student, [scan for scan, _, _ in cases])
     if not heard:
         raise NotImplementedError("Bumper.on_scan publishes nothing")
@@ -123,7 +125,7 @@ def _bumper_ahead(student: Any) -> None:
 
 @suite.test("bumper", points=2, name="to the sides and behind", reread="Exercise 2")
 def _bumper_sides(student: Any) -> None:
-    cases = [
+    cases: list[Case] = [
         ({20: 0.3}, True, "both-sides"),
         ({-20: 0.3}, True, "both-sides"),
         ({50: 0.3}, False, "angles-are-radians"),
@@ -134,7 +136,7 @@ def _bumper_sides(student: Any) -> None:
 
 @suite.test("bumper", points=2, name="inf, -inf and NaN", reread="Exercise 2, REP 117")
 def _bumper_special(student: Any) -> None:
-    cases = [
+    cases: list[Case] = [
         ({0: math.inf, 10: math.inf}, False, "nearer-than"),
         ({0: math.nan}, False, "nan-is-no-obstacle"),
         ({0: math.nan, 10: 0.3}, True, "nan-is-no-obstacle"),

@@ -78,7 +78,7 @@ class McapOut:
         self._file = path.open("xb", buffering=0)
         self._stored = 0
         self._writer: Any = Writer(
-            self.stage_file,  # type: ignore[arg-type]
+            self.stage_file,
             chunk_size=chunk_bytes,
             compression=CompressionType[compression.upper()],
         )
