@@ -27,6 +27,7 @@ COMMANDS: dict[str, Command] = {
     "demo": Command("robotbrain.demo", "grade the sample class, drive the robot, show one page"),
     "drive": Command("robotbrain.pipeline.commands:drive", "let a brain drive in worlds of your choice"),
     "robot": Command("robotbrain.link.commands:robot", "the simulated robot as a process of its own"),
+    "safety": Command("robotbrain.link.commands:safety", "the safety node of a physical robot, on ROS 2"),
     "estop": Command("robotbrain.link.commands:estop", "set or release the emergency stop of such a robot"),
     "bag": Command("robotbrain.ros.bag_command:bag", "look into a recorded run, check it, make it whole"),
     "lab": Command("robotbrain.jupyter", "open JupyterLab on the course"),

@@ -1,4 +1,8 @@
-"""``robotbrain robot``: the simulated robot as a process; ``robotbrain estop``: stop it from another terminal."""
+"""The robot's side of the command line.
+
+``robotbrain robot``: the simulated robot as a process; ``robotbrain safety``: the safety node for a physical one;
+``robotbrain estop``: stop the former from another terminal.
+"""
 
 from __future__ import annotations
 
@@ -67,6 +71,33 @@ def robot_main(arguments: argparse.Namespace) -> int:
             print(f"replay: {robot.replay.to_html(arguments.html)}", flush=True)
 
     run_robot(options, lambda text: print(text, flush=True), finish)
+    return 0
+
+
+def safety_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of ``robotbrain safety``."""
+    parser.add_argument("--description", type=Path, help="TOML file of the robot; its table [safety] has the limits")
+
+
+def safety_main(arguments: argparse.Namespace) -> int:
+    """Run the safety node on genuine ROS 2, on the robot's own computer, until Ctrl-C."""
+    from robotbrain.link.description import RobotDescription, load_description
+    from robotbrain.link.runtime import RclpyRuntime
+
+    end_on_terminate()
+    robot = load_description(arguments.description) if arguments.description else RobotDescription()
+    runtime = RclpyRuntime(robot.ros_arguments())
+    try:
+        from robotbrain.pipeline.nodes.safety import SafetyNode, limits_from
+
+        limits = limits_from(robot.safety)
+        runtime.make(lambda: SafetyNode(limits))
+        print(f"cmd_vel becomes cmd_vel_safe; {limits}", flush=True)
+        runtime.run(lambda: False)
+    except KeyboardInterrupt:
+        print("interrupted")
+    finally:
+        runtime.close()
     return 0
 
 

@@ -28,6 +28,9 @@ REFRESH_S = 0.1
 LARGEST_DOMAIN = 101
 """Above this the ports that RTPS derives from the domain collide with others on some systems."""
 
+ENDLESS_NS = 1 << 62
+"""A deadline this long is none."""
+
 LOOPBACK = """\
 <CycloneDDS><Domain>
 <General><Interfaces><NetworkInterface address="127.0.0.1" multicast="false"/></Interfaces>
@@ -259,6 +262,6 @@ def dds_qos(qos: QoSProfile) -> Any:
         # A process must not hear its own messages twice.
         Policy.IgnoreLocal.Participant,
     ]
-    if qos.deadline.nanoseconds:
+    if 0 < qos.deadline.nanoseconds < ENDLESS_NS:
         policies.append(Policy.Deadline(duration(nanoseconds=qos.deadline.nanoseconds)))
     return Qos(*policies)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,9 @@ from robotbrain.ros.conversions import msg_class
 
 LOOK_S = 0.25
 """New topics of genuine ROS 2 are looked for this often."""
+
+DEPTH = 100
+"""Messages of a topic that wait at most while the disk is busy."""
 
 IGNORED = frozenset({"/rosout", "/parameter_events"})
 
@@ -26,6 +29,19 @@ def record(runtime: Runtime, path: Path) -> Callable[[], None]:
     if isinstance(runtime, KitRuntime):
         return BagRecorder(path, runtime.context, exclude=IGNORED).close
     return _GenuineRecorder(runtime, path).close
+
+
+def accepting(offers: Sequence[Any]) -> Any:
+    """Return a QoS profile that gets along with each of the publishers' profiles and asks for as much as all offer."""
+    from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+    reliable = all(offer.reliability == ReliabilityPolicy.RELIABLE for offer in offers)
+    latched = all(offer.durability == DurabilityPolicy.TRANSIENT_LOCAL for offer in offers)
+    return QoSProfile(
+        depth=DEPTH,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
 
 
 class _GenuineRecorder:
@@ -48,10 +64,9 @@ class _GenuineRecorder:
         return self._node
 
     def _look(self) -> None:
-        from rclpy.qos import qos_profile_best_available
-
         for topic, types in self._node.get_topic_names_and_types():
-            if topic in self._known:
+            offers = [info.qos_profile for info in self._node.get_publishers_info_by_topic(topic)]
+            if topic in self._known or not offers:
                 continue
             self._known.add(topic)
             try:
@@ -59,9 +74,7 @@ class _GenuineRecorder:
             except (ImportError, AttributeError):
                 self._node.get_logger().warning(f"{topic} is not recorded: {types[0]} is not installed here")
                 continue
-            self._node.create_subscription(
-                kind, topic, self._listener(topic, types[0]), qos_profile_best_available, raw=True
-            )
+            self._node.create_subscription(kind, topic, self._listener(topic, types[0]), accepting(offers), raw=True)
 
     def _listener(self, topic: str, type_name: str) -> Callable[[bytes], None]:
         def listen(data: bytes) -> None:

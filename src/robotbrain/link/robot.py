@@ -92,18 +92,13 @@ class SimulatedRobot:
     """
 
     def __init__(self, sim: RobotSim, make: Callable[[Callable[[], Any]], Any], options: RobotOptions) -> None:
-        from robotbrain.pipeline.nodes.safety import SafetyLimits, SafetyNode
+        from robotbrain.pipeline.nodes.safety import SafetyNode, limits_from
         from robotbrain.sim.view import Replay
 
         self.sim = sim
         self.replay: Replay = Replay(sim.world)
         self._log = options.log.open("w", encoding="utf-8", buffering=1) if options.log else None
-        try:
-            limits = SafetyLimits(**options.safety)
-        except TypeError as error:
-            raise InputError(
-                "safety limits", given=dict(options.safety), expected="fields of SafetyLimits", fix=f"{error}."
-            ) from None
+        limits = limits_from(options.safety)
         self.safety = make(lambda: SafetyNode(limits))
         self.node = make(lambda: self._make_robot(options))
 

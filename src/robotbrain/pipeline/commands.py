@@ -70,7 +70,11 @@ def _ros_arguments(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--bag", type=Path, help="record all topics to a rosbag2 folder of this name")
     group.add_argument("--decisions", type=Path, help="write commands, plans and goals to this file, as JSON lines")
     group.add_argument(
-        "--part", action="append", default=[], metavar="ROLE=FILE.py:CLASS", help="a node of your own in the brain"
+        "--part",
+        action="append",
+        default=[],
+        metavar="ROLE=FILE:CLASS",
+        help="a node of your own, from a .py file or a notebook",
     )
 
 
@@ -79,8 +83,9 @@ def _drive_ros(arguments: argparse.Namespace) -> int:
     from robotbrain.link.commands import end_on_terminate
     from robotbrain.link.description import RobotDescription, load_description
     from robotbrain.link.handshake import parse_address
+    from robotbrain.link.parts import load_part
     from robotbrain.link.runtime import use_kit
-    from robotbrain.pipeline.remote import RemoteOptions, drive_remote, load_part
+    from robotbrain.pipeline.remote import RemoteOptions, drive_remote
 
     end_on_terminate()
     host, port = parse_address(arguments.address)

@@ -43,6 +43,26 @@ def msg_class(typename: str) -> Any:
 # ---------------------------------------------------------------- time and headers
 
 
+def time_ns(time: Any) -> int:
+    """Return ns of an ``rclpy`` time or duration, a ``builtin_interfaces`` one, a stamped message, or a number of ns.
+
+    Raises:
+        InputError: for anything else.
+    """
+    header = getattr(time, "header", None)
+    if header is not None:
+        time = header.stamp
+    if isinstance(time, (int, np.integer)) and not isinstance(time, bool):
+        return int(time)
+    if hasattr(time, "nanoseconds"):
+        return int(time.nanoseconds)
+    if hasattr(time, "sec") and hasattr(time, "nanosec"):
+        return int(time.sec) * NS_PER_S + int(time.nanosec)
+    raise InputError(
+        "time", given=time, expected="a Time, a stamp, a message with a header, or ns", fix="Pass msg.header.stamp."
+    )
+
+
 def time_to_ns(stamp: Any) -> int:
     """Return a ``builtin_interfaces/msg/Time`` (or Duration) as ns."""
     return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)

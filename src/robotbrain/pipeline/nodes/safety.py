@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from geometry_msgs.msg import Twist
@@ -69,6 +70,21 @@ class SafetyLimits:
         """Return the velocity with the same curvature within the speed limits."""
         scale = 1.0 / max(1.0, abs(v) / self.max_speed, abs(w) / self.max_yaw_rate)
         return v * scale, w * scale
+
+
+def limits_from(values: Mapping[str, float]) -> SafetyLimits:
+    """Return the limits with some fields replaced.
+
+    Raises:
+        InputError: unknown fields or impossible values.
+    """
+    known = {field.name for field in dataclasses.fields(SafetyLimits)}
+    for name in values:
+        if name not in known:
+            raise InputError(
+                "safety limit", given=name, expected="one of " + ", ".join(sorted(known)), fix="Check the spelling."
+            )
+    return SafetyLimits(**values)
 
 
 class TwistLimiter:
