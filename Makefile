@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint format lab labs train bench profiles proof-drive proof-devices mutation-test clean
+.PHONY: help install demo test lint format lab labs train bench profiles proof-drive proof-devices proof-bottlenecks conformance-ros mutation-test clean
 
 help:  ## Show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-15s %s\n", $$1, $$2}'
@@ -40,7 +40,7 @@ lab: $(STAMP)  ## Open JupyterLab on the course
 	$(BIN)/robotbrain lab
 
 labs: $(STAMP)  ## Generate labs/ from solutions/
-	$(BIN)/robotbrain generate lab_integration
+	$(BIN)/robotbrain generate
 
 train: $(STAMP)  ## Train the perception network again (a few minutes) and report its figure
 	$(BIN)/robotbrain train segmentation
@@ -51,18 +51,29 @@ proof-drive: $(STAMP)  ## Drive 100 unseen worlds (about ten minutes)
 proof-devices: $(STAMP)  ## Drive the same 20 worlds on five Jetsons (about twenty minutes)
 	$(BIN)/python benchmarks/devices.py
 
+proof-bottlenecks: $(STAMP)  ## Find planted bottlenecks in generated pipelines, and check what the cure was said to bring
+	$(BIN)/python benchmarks/bottlenecks.py
+
+conformance-ros: $(STAMP)  ## Compare the kit with genuine ROS 2 (Linux x86-64; downloads about 1.7 GB once)
+	$(BIN)/python -m tests.conformance_ros
+	$(BIN)/python -m tests.conformance_ros.drive
+
 profiles: $(STAMP)  ## Calibrate the Jetson twin and write the reference profiles again
 	$(BIN)/robotbrain jetson calibrate
 	$(BIN)/robotbrain jetson reference
 
-mutation-test: $(STAMP)  ## Test the tests of the lab with named wrong solutions
+mutation-test: $(STAMP)  ## Test the tests of the labs with named wrong solutions
 	$(BIN)/robotbrain mutation-test lab_integration --jobs 2
+	$(BIN)/robotbrain mutation-test hw3_performance --jobs 2
 
 bench: $(STAMP)  ## Run the benchmarks; each prints one table
 	$(BIN)/python benchmarks/ros_rate.py
 	$(BIN)/python benchmarks/sim_rate.py
 	$(BIN)/python benchmarks/twin_accuracy.py
 	$(BIN)/python benchmarks/cpu_work.py
+	$(BIN)/python benchmarks/patterns.py
+	$(BIN)/python benchmarks/jitter.py
+	$(BIN)/python benchmarks/monitoring_overhead.py
 
 clean:  ## Remove .venv, caches and generated pages
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache demo build dist

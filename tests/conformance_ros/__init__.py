@@ -1,0 +1,1 @@
+"""One suite of ordinary rclpy programs, run on the kit and on genuine rclpy, comparing what they decided."""
