@@ -224,3 +224,11 @@ def test_bad_loops_are_explained(arguments):
 def test_bad_priorities_are_explained(priority):
     with pytest.raises(InputError, match="priority"):
         try_realtime_priority(priority)
+
+
+def test_a_call_that_comes_periods_late_is_as_late_as_it_is() -> None:
+    period = 1_000_000
+    starts = np.array([1.0, 4.6, 5.0, 6.0]) * period  # the second call, due at 2, came 2.6 periods late
+    times = LoopTimes("timer", period, starts.astype(np.int64), starts.astype(np.int64) + 1000)
+    found = jitter.JitterResult("timer", 1000.0, times, 0.0)
+    assert found.wakeup_us.tolist() == [0.0, 2600.0, 0.0, 0.0] and found.skipped == 2

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robotbrain.errors import InputError
-from robotbrain.pipeline.patterns.rates import METHODS, LoopTimes, Method, next_due
+from robotbrain.pipeline.patterns.rates import METHODS, LoopTimes, next_due
 
 WallMethod = Literal["sleep", "sleep_rest", "until", "timer", "spin"]
 WALL_METHODS: tuple[WallMethod, ...] = (*METHODS, "spin")
@@ -54,16 +54,18 @@ class JitterResult:
     def wakeup_us(self) -> NDArray[np.float64]:
         """How late each call started after it was due, μs.
 
-        Due is one period after the last call's end (``sleep``) or start (``sleep_rest``), else the grid.
+        Due is one period after the last call's end (``sleep``) or start (``sleep_rest``), else a time of the grid: with
+        ``timer`` the first one that had not passed when the last call started, otherwise simply the next one.
         """
         starts, ends, period = self.times.starts_ns, self.times.ends_ns, self.times.period_ns
-        if self.method == "sleep":
-            due = np.concatenate([[period], ends[:-1] + period])
-        elif self.method == "sleep_rest":
-            due = np.concatenate([[period], np.maximum(starts[:-1] + period, ends[:-1])])
-        else:
-            return np.asarray(self.times.phase_ns / 1000, dtype=float)
-        return np.asarray((starts - due) / 1000, dtype=float)
+        late = np.empty(len(starts))
+        due = period
+        for k, (start, end) in enumerate(zip(starts.tolist(), ends.tolist(), strict=True)):
+            late[k] = start - due
+            due = next_due(_rule(self.method), due, start, end, period)
+            if self.method == "sleep_rest":
+                due = max(due, end)  # there was no rest to sleep
+        return late / 1000
 
     @property
     def period_error_us(self) -> NDArray[np.float64]:
@@ -130,6 +132,11 @@ def measure_jitter(
     return JitterResult(method, hz, times, used, "normal" if granted is None else str(granted))
 
 
+def _rule(method: str) -> str:
+    """Return the rule of ``next_due`` by which a method waits."""
+    return "timer" if method == "spin" else method
+
+
 def _run_loop(
     method: WallMethod,
     period: int,
@@ -138,7 +145,7 @@ def _run_loop(
     clock: Callable[[], int],
     sleep: Callable[[float], object],
 ) -> tuple[list[int], list[int]]:
-    rule: Method = "timer" if method == "spin" else method
+    rule = _rule(method)
     starts, ends = [0] * count, [0] * count
     zero = clock()
     now, due = 0, period

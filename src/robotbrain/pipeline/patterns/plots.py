@@ -31,10 +31,10 @@ __all__ = [
     "plot_timeline",
 ]
 
-LINES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+LINES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#1B1B1B")
 """Colours of curves."""
 
-DASHES = ("-", (0, (5, 1.5)), (0, (1.2, 1.2)), (0, (6, 1.5, 1.2, 1.5)), (0, (3, 1)), (0, (8, 2)))
+DASHES = ("-", (0, (5, 1.5)), (0, (1.2, 1.2)), (0, (6, 1.5, 1.2, 1.5)), (0, (3, 1)), (0, (8, 2)), (0, (2, 3)))
 """Dashes of curves, so that they can be told apart without colour."""
 
 # ------------------------------------------------------------ ages
@@ -149,7 +149,8 @@ def plot_safe_speed(
     top = float(axes.get_ylim()[1])
     for name, age in (ages_ms or {}).items():
         axes.axvline(age, color=QUIET, lw=1, zorder=1)
-        axes.text(age, 0.02 * top, f"{name} ", rotation=90, va="bottom", ha="right", fontsize=9, color=QUIET)
+        label = axes.text(age, 0.02 * top, f"{name} ", rotation=90, va="bottom", ha="right", fontsize=9, color=QUIET)
+        label.set_bbox({"facecolor": "white", "edgecolor": "none", "pad": 0.5, "alpha": 0.85})
     axes.set(xlim=(0, longest_ms), ylim=(0, top), xlabel="age of the data when the brakes bite (ms)")
     axes.set_ylabel("largest safe speed (m/s)")
     tidy(axes)
