@@ -8,6 +8,7 @@ import gzip
 import json
 import pickle
 import random
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -145,11 +146,15 @@ def test_absurd_lengths_are_refused_at_once():
             deserialize_message(header + b"\xff\xff\xff\xff", message_class(typename))
 
 
-def test_big_endian_and_garbage_are_refused():
+def test_big_endian_is_read_and_garbage_is_refused():
     twist = message_class("geometry_msgs/msg/Twist")
-    for data in (b"\x00\x00\x00\x00" + bytes(48), b"", b"hello world"):
-        with pytest.raises(InputError, match="little-endian"):
-            deserialize_message(data, twist)
+    values = (1.0, -2.5, 3e-9, 4.0, 5.0, 6.0)
+    read = deserialize_message(b"\x00\x00\x00\x00" + struct.pack(">6d", *values), twist)
+    assert (read.linear.x, read.linear.y, read.linear.z, read.angular.x, read.angular.y, read.angular.z) == values
+    for data in (b"", b"hello world", b"\x00\x00\x00\x00" + bytes(5)):
+        for error in (InputError, RuntimeError):
+            with pytest.raises(error, match="little-endian"):
+                deserialize_message(data, twist)
 
 
 @pytest.mark.parametrize("typename", ["sensor_msgs/msg/Imu", "nav_msgs/msg/Path", "rcl_interfaces/msg/Parameter"])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import pytest
 from rclpy.executors import MultiThreadedExecutor
 from rclpy.node import Node
@@ -118,7 +120,7 @@ def test_workers_are_numbered_and_never_do_two_things_at_once(context: SimContex
     assert {c.worker for c in callbacks} == {0, 1, 2} and len({c.executor for c in callbacks}) == 1
     for worker in range(3):
         mine = sorted((c.start_ns, c.end_ns) for c in callbacks if c.worker == worker)
-        assert all(end <= start for (_, end), (start, _) in zip(mine, mine[1:], strict=False))
+        assert all(end <= start for (_, end), (start, _) in itertools.pairwise(mine))
 
 
 def test_filters_drop_double_delay_and_change_messages(context: SimContext) -> None:

@@ -38,6 +38,38 @@ def stamp_of(data: bytes) -> int:
 
 
 @dataclass(frozen=True)
+class QueueCounts:
+    """How a node's subscriptions to one topic stand.
+
+    Attributes:
+        dropped: messages that a full queue pushed out.
+        expired: messages that outlived their lifespan.
+        limit: how many may wait; None for no limit.
+    """
+
+    dropped: int
+    expired: int
+    limit: int | None
+
+
+def read_queues(context: SimContext) -> dict[tuple[str, str], QueueCounts]:
+    """Return how the subscriptions of a simulation stand, by (node, topic)."""
+    found: dict[tuple[str, str], QueueCounts] = {}
+    for topic in context.topics.values():
+        for subscription in topic.subscriptions:
+            place = (subscription.node.get_fully_qualified_name(), topic.name)
+            limit = subscription.qos_profile.queue_limit
+            expired = int(getattr(subscription, "expired", 0))
+            before = found.get(place, QueueCounts(0, 0, 0))
+            found[place] = QueueCounts(
+                before.dropped + subscription.dropped,
+                before.expired + expired,
+                None if limit is None or before.limit is None else before.limit + limit,
+            )
+    return found
+
+
+@dataclass(frozen=True)
 class Trace:
     """A run as plain data.
 
@@ -51,6 +83,8 @@ class Trace:
         expired: (node, topic) of messages that outlived their lifespan before they were taken.
         roles: what part of the brain each node plays, by its fully qualified name.
         title: what was run.
+        queue_limits: how many messages may wait in the subscription of (node, topic); without limit: missing.
+        periods_ns: of the timers, by (node, name of the callback).
     """
 
     start_ns: int
@@ -63,6 +97,8 @@ class Trace:
     expired: Mapping[tuple[str, str], int] = field(default_factory=dict)
     roles: Mapping[str, str] = field(default_factory=dict)
     title: str = ""
+    queue_limits: Mapping[tuple[str, str], int] = field(repr=False, default_factory=dict)
+    periods_ns: Mapping[tuple[str, str], int] = field(repr=False, default_factory=dict)
 
     @property
     def seconds(self) -> float:
@@ -129,12 +165,7 @@ class Recorder:
         """
         context = self._context
         now = context.now_ns
-        dropped: dict[tuple[str, str], int] = {}
-        for topic in context.topics.values():
-            for subscription in topic.subscriptions:
-                if subscription.dropped:
-                    place = (subscription.node.get_fully_qualified_name(), topic.name)
-                    dropped[place] = dropped.get(place, 0) + subscription.dropped
+        queues = read_queues(context)
         capacity: dict[str, int] = {}
         if context.resources is not None:
             capacity = {n: context.resources.cpu_cores if n == "cpu" else 1 for n in context.resources.names}
@@ -146,7 +177,14 @@ class Recorder:
             messages=tuple(self._messages),
             stamps=dict(self._stamps),
             capacity=capacity,
-            dropped=dropped,
+            dropped={place: found.dropped for place, found in queues.items() if found.dropped},
+            expired={place: found.expired for place, found in queues.items() if found.expired},
             roles=dict(roles or {}),
             title=self._title,
+            queue_limits={place: found.limit for place, found in queues.items() if found.limit is not None},
+            periods_ns={
+                (node.get_fully_qualified_name(), timer.name): timer.timer_period_ns
+                for node in context.nodes
+                for timer in node.timers
+            },
         )

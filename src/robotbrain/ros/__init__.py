@@ -6,7 +6,8 @@ and :data:`BACKEND` is ``"rclpy"``. Set the environment variable ``ROBOTBRAIN_RO
 a machine that has ROS 2.
 
 The simulation itself is :class:`SimContext`; :func:`charge` and :func:`charge_work` add to the cost of the running
-callback, and :class:`DeviceResources` are what callbacks share.
+callback, ``await`` of :func:`sleep` lets time pass in an ``async def`` one, and :class:`DeviceResources` are what
+callbacks share.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from __future__ import annotations
 import os
 
 from robotbrain.ros.api import charge, charge_work
+from robotbrain.ros.asynchronous import sleep
 from robotbrain.ros.context import CallbackRecord, CostModel, MessageRecord, SimContext
 from robotbrain.ros.exceptions import CallbackError, ReentrancyError, SimulationDeadlockError
 from robotbrain.ros.resources import DeviceResources
@@ -33,6 +35,7 @@ __all__ = [
     "charge",
     "charge_work",
     "install",
+    "sleep",
     "uninstall",
 ]
 

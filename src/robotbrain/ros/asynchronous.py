@@ -11,8 +11,8 @@ if TYPE_CHECKING:
 def sleep(node: Any, seconds: float) -> Future:
     """Return a future that is done ``seconds`` later by the node's clock: ``await sleep(self, 0.5)``.
 
-    Awaiting it hands the thread back, so that other callbacks run and what was published leaves. It is a one-shot timer in
-    a callback group of its own, nothing more, and works with genuine rclpy as well.
+    Awaiting it hands the thread back, so that other callbacks run and what was published leaves. It is a one-shot timer
+    in a callback group of its own, nothing more, and works with genuine rclpy as well.
     """
     from rclpy.callback_groups import ReentrantCallbackGroup
     from rclpy.task import Future

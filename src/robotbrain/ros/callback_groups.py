@@ -19,7 +19,7 @@ class CallbackGroup:
         """Tell whether a timer, subscription, service or client belongs to this group."""
         return getattr(entity, "callback_group", None) is self and not getattr(entity, "destroyed", False)
 
-    def can_execute(self, entity: Any = None) -> bool:
+    def can_execute(self) -> bool:
         """Tell whether one more callback of this group may start now."""
         raise NotImplementedError
 
@@ -27,7 +27,7 @@ class CallbackGroup:
 class ReentrantCallbackGroup(CallbackGroup):
     """Callbacks of this group run in parallel, each with itself too."""
 
-    def can_execute(self, entity: Any = None) -> bool:
+    def can_execute(self) -> bool:
         """Return True."""
         return True
 
@@ -35,6 +35,6 @@ class ReentrantCallbackGroup(CallbackGroup):
 class MutuallyExclusiveCallbackGroup(CallbackGroup):
     """At most one callback of this group runs at a time."""
 
-    def can_execute(self, entity: Any = None) -> bool:
+    def can_execute(self) -> bool:
         """Return True while no callback of the group runs."""
         return self.active == 0

@@ -9,12 +9,23 @@ from __future__ import annotations
 import contextlib
 import heapq
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any, Literal
 
 from robotbrain.errors import InputError
+from robotbrain.ros.arguments import NodeArguments, parse_arguments
 from robotbrain.ros.exceptions import CallbackError, NotInitializedException, ReentrancyError
+from robotbrain.ros.execution import (
+    CallbackRecord,
+    CallbackTap,
+    CostModel,
+    Event,
+    Execution,
+    Filter,
+    MessageRecord,
+    MessageTap,
+    Tap,
+)
 from robotbrain.ros.logging import (
     LoggingSeverity,
     LogRecord,
@@ -23,133 +34,33 @@ from robotbrain.ros.logging import (
     get_logging_severity_from_string,
     print_sink,
 )
-from robotbrain.ros.arguments import NodeArguments, parse_arguments
-from robotbrain.ros.resources import RESOURCES, DeviceResources, Segment
+from robotbrain.ros.resources import RESOURCES, DeviceResources
+from robotbrain.ros.threads import Driver
 
 if TYPE_CHECKING:
     from robotbrain.ros.executors import Executor
+    from robotbrain.ros.matching import Topic
     from robotbrain.ros.node import Node
     from robotbrain.ros.services import Service
-    from robotbrain.ros.matching import Topic
 
-Event = Callable[[Any], None]
-Tap = Callable[[int, str, str, str, bytes], None]
-CallbackTap = Callable[["CallbackRecord"], None]
-MessageTap = Callable[["MessageRecord", bytes], None]
-Filter = Callable[["MessageRecord", bytes], Sequence[tuple[bytes, int]]]
-
-
-class CostModel(Protocol):
-    """How long callbacks take.
-
-    A model may have three more methods, all of which return ns of CPU time:
-
-    - ``work_ns(kind, units)``: of work that a callback did and names by :func:`robotbrain.ros.charge_work`;
-    - ``uncharged_ns(node_name, kind, name)``: of a callback that charged nothing itself;
-    - ``traffic_ns(node_name, received, sent)``: of taking a message of ``received`` bytes off the wire (None: there
-      was none) and putting messages of ``sent`` bytes each on it.
-    """
-
-    def cost(self, node_name: str, kind: str, name: str) -> int:
-        """Return the simulated nanoseconds of one callback.
-
-        Args:
-            node_name: fully qualified node name, e.g. ``/planner``.
-            kind: ``timer``, ``subscription``, ``service`` or ``client``.
-            name: topic or service name; for a timer the name of its callback function.
-        """
-        ...
-
-
-@dataclass(frozen=True, slots=True)
-class MessageRecord:
-    """One message on its way: what it is, who sent it, and when it left.
-
-    Attributes:
-        id: counted from 1 in each context, in the order in which messages were given to the middleware.
-        kind: ``topic``, ``request`` or ``response``.
-        name: of the topic or service.
-        type_name: ROS type, e.g. ``sensor_msgs/msg/LaserScan``; for requests and responses that of the service.
-        node: fully qualified name of the sender.
-        released_ns: simulated time at which it left: when the callback that sent it was over.
-        size: bytes of CDR.
-    """
-
-    id: int
-    kind: Literal["topic", "request", "response"]
-    name: str
-    type_name: str
-    node: str
-    released_ns: int
-    size: int
-
-
-@dataclass(frozen=True, slots=True)
-class CallbackRecord:
-    """One executed callback, for monitoring: became ready, started and ended at these simulated times (ns).
-
-    Attributes:
-        node: fully qualified name of its node.
-        kind: ``timer``, ``subscription``, ``service`` or ``client``.
-        name: topic or service name; for a timer the name of its callback function.
-        ready_ns: when it could have started, had its worker and callback group been free.
-        start_ns: when it started.
-        end_ns: when what it published was released, and its worker free again.
-        demand_ns: what it cost.
-        segments: the cost in order, as (resource, ns).
-        id: counted from 1 in each context, in the order of starting.
-        message: ``id`` of the message that set it off; 0 for a timer.
-        published: ``id`` of every message that it sent, in order.
-        executor: number of its executor, from 0 in the order in which a context's executors were made.
-        worker: which of the executor's threads ran it, from 0.
-    """
-
-    node: str
-    kind: str
-    name: str
-    ready_ns: int
-    start_ns: int
-    end_ns: int
-    demand_ns: int = 0
-    segments: tuple[Segment, ...] = ()
-    id: int = 0
-    message: int = 0
-    published: tuple[int, ...] = ()
-    executor: int = 0
-    worker: int = 0
-
-    @property
-    def queued_ns(self) -> int:
-        """How long it waited to be started."""
-        return self.start_ns - self.ready_ns
-
-    @property
-    def contention_ns(self) -> int:
-        """How much longer it took than it would have on an idle device."""
-        return self.end_ns - self.start_ns - self.demand_ns
-
-
-@dataclass(slots=True)
-class Execution:
-    """The callback that is running now: what it charged and what it has to release when its cost is over."""
-
-    node: Node
-    cost_model: CostModel | None = None
-    id: int = 0
-    message: int = 0
-    worker: int = 0
-    segments: list[Segment] = field(default_factory=list)
-    outbox: list[tuple[Event, Any]] = field(default_factory=list)
-    published: list[int] = field(default_factory=list)
-
-    def add(self, resource: str, nanoseconds: int) -> None:
-        """Append to the cost; CPU time that follows CPU time is one segment."""
-        segments = self.segments
-        if not nanoseconds:
-            return
-        if resource == "cpu" and segments and segments[-1][0] == "cpu":
-            nanoseconds += segments.pop()[1]
-        segments.append((resource, nanoseconds))
+__all__ = [
+    "CallbackRecord",
+    "CallbackTap",
+    "Context",
+    "CostModel",
+    "Event",
+    "Execution",
+    "Filter",
+    "MessageRecord",
+    "MessageTap",
+    "SimContext",
+    "Tap",
+    "active_context",
+    "get_default_context",
+    "peek_default_context",
+    "set_default_context",
+    "set_running",
+]
 
 
 class SimContext:
@@ -212,6 +123,7 @@ class SimContext:
         self.message_count = 0
         self.goal_count = 0
         self.running: Execution | None = None
+        self.driver = Driver()
         self.holding = False
         self.held: list[Executor] = []
         self._arrivals: list[tuple[Event, Any]] | None = None
@@ -234,6 +146,7 @@ class SimContext:
         if self._init_called:
             raise RuntimeError("Context.init() must only be called once; call rclpy.shutdown() first")
         self._init_called = True
+        self.driver.take()
         self.arguments = parse_arguments(args)
         for logger, level in self.arguments.log_levels:
             if logger:
@@ -255,6 +168,7 @@ class SimContext:
         """As :meth:`shutdown`, without an error when it already is."""
         if self._ok:
             self._ok = False
+            self.driver.ended.set()
             for callback in self._on_shutdown:
                 callback()
 
@@ -263,8 +177,8 @@ class SimContext:
         self._on_shutdown.append(callback)
 
     def require_ok(self) -> None:
-        """Raise NotInitializedException after shutdown."""
-        if not self._ok:
+        """Raise NotInitializedException before ``init`` or after shutdown."""
+        if not self.ok():
             raise NotInitializedException("the context has been shut down: call rclpy.init() again")
 
     @contextlib.contextmanager
@@ -387,13 +301,14 @@ class SimContext:
     def step(self) -> bool:
         """Process one event; return False when there is none, or after shutdown."""
         self.check_not_in_callback("step")
-        if not self._heap or not self._ok:
-            return False
-        self.now_ns, _, event, argument = heapq.heappop(self._heap)
-        event(argument)
-        if self._failures:
-            raise self._failures.popleft()
-        return True
+        with self.driver.lock:
+            if not self._heap or not self._ok:
+                return False
+            self.now_ns, _, event, argument = heapq.heappop(self._heap)
+            event(argument)
+            if self._failures:
+                raise self._failures.popleft()
+            return True
 
     def next_event_ns(self) -> int | None:
         """Return the time of the next event, or None when nothing is pending."""
@@ -418,15 +333,16 @@ class SimContext:
                 fix="Time runs forward.",
             )
         heap, pop, failures = self._heap, heapq.heappop, self._failures
-        while heap and heap[0][0] <= time_ns:
-            if not self._ok:
-                return
-            self.now_ns, _, event, argument = pop(heap)
-            event(argument)
-            if failures:
-                raise failures.popleft()
-        if self._ok:
-            self.now_ns = time_ns
+        with self.driver.lock:
+            while heap and heap[0][0] <= time_ns:
+                if not self._ok:
+                    return
+                self.now_ns, _, event, argument = pop(heap)
+                event(argument)
+                if failures:
+                    raise failures.popleft()
+            if self._ok:
+                self.now_ns = max(time_ns, self.now_ns)
 
     def run_for(self, seconds: float) -> None:
         """Run for so many simulated seconds; see :meth:`run_until`."""
@@ -442,11 +358,21 @@ class SimContext:
 
     def check_not_in_callback(self, what: str) -> None:
         """Raise ReentrancyError inside a callback."""
-        if self.running is not None:
+        running = self.running
+        if running is not None and self.in_callback():
             raise ReentrancyError(
-                f"{what} was called inside a callback of {self.running.node.get_fully_qualified_name()}; "
+                f"{what} was called inside a callback of {running.node.get_fully_qualified_name()}; "
                 "a callback must return to let others run: use call_async with add_done_callback, or a timer"
             )
+
+    @property
+    def simulated(self) -> bool:
+        """Whether this context makes its own time; a subclass that steps otherwise runs in real time."""
+        return type(self).step is SimContext.step
+
+    def in_callback(self) -> bool:
+        """Tell whether the calling thread is inside a callback."""
+        return self.running is not None and (not self.simulated or self.driver.inside())
 
     def transport_ns(self, name: str, size: int) -> int:
         """Return the transport latency of ``size`` bytes on a topic or service."""
@@ -531,6 +457,14 @@ class SimContext:
     def get_logger(self) -> RcutilsLogger:
         """Return the logger of the context itself."""
         return self._logger
+
+
+class Context(SimContext):
+    """``rclpy.Context``: not ready before ``rclpy.init(context=...)``."""
+
+    def ok(self) -> bool:
+        """Tell whether the context has been initialised and not shut down."""
+        return self._ok and self._init_called
 
 
 _default: SimContext | None = None

@@ -1,4 +1,4 @@
-"""QoS events (``rclpy.event_handler``): what a publisher or subscription is told about the other side and its deadlines."""
+"""QoS events (``rclpy.event_handler``): what publishers and subscriptions are told of the other side and deadlines."""
 
 from __future__ import annotations
 
@@ -263,3 +263,8 @@ class PublisherEventCallbacks:
 def default_incompatible_qos(callbacks: SubscriptionEventCallbacks | PublisherEventCallbacks | None) -> bool:
     """Tell whether an endpoint with these callbacks warns of incompatible QoS."""
     return callbacks is None or (callbacks.incompatible_qos is None and callbacks.use_default_callbacks)
+
+
+def adder(handler: EventHandler | None) -> Callable[[], None] | None:
+    """Return what adds one to the count of an event, or None when nobody is told of it."""
+    return handler.add if handler is not None else None

@@ -110,8 +110,8 @@ class ReentrancyError(RobotBrainError, RuntimeError):
 class CallbackError(RobotBrainError, RuntimeError):
     """A callback raised. The original exception is ``__cause__`` (and ``cause``).
 
-    It is also an instance of the original's class, so that ``except KeyError`` around ``spin`` works as in genuine rclpy,
-    which raises the original.
+    It is also an instance of the original's class, so that ``except KeyError`` around ``spin`` works as in genuine
+    rclpy, which raises the original.
 
     Attributes:
         node: the node whose callback it was.
@@ -126,7 +126,7 @@ class CallbackError(RobotBrainError, RuntimeError):
     def __new__(cls, node: Node, *, cause: BaseException, **details: object) -> CallbackError:
         """Make an instance of the class that is both."""
         try:
-            return type(cause).__new__(_with(cls, type(cause)))  # type: ignore[return-value]
+            return type(cause).__new__(_with(cls, type(cause)))  # type: ignore[arg-type]
         except TypeError:  # an exception whose constructor wants more
             return Exception.__new__(cls)
 

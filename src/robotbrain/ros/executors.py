@@ -7,14 +7,12 @@ t + c, where c is its cost, if it has the device to itself; where callbacks shar
 became ready.
 """
 
-# ruff: noqa: N818 - the names are those of rclpy.executors
-
 from __future__ import annotations
 
 import heapq
-import inspect
 from collections import deque
 from collections.abc import Callable
+from types import CoroutineType
 from typing import TYPE_CHECKING, Any
 
 from robotbrain.errors import InputError
@@ -50,7 +48,7 @@ __all__ = [
 async def await_or_execute(callback: Callable[..., Any], *args: Any) -> Any:
     """Call ``callback(*args)``, await it if it is a coroutine function, and return its result."""
     result = callback(*args)
-    return await result if inspect.iscoroutine(result) else result
+    return await result if isinstance(result, CoroutineType) else result
 
 
 class Work:
@@ -200,9 +198,9 @@ class Executor(Spinner):
 
     def dispatch(self) -> None:
         """Start what is ready, as far as workers and callback groups are free."""
-        while self._idle:
+        while self._ready and self._idle:
             if not self._budget:
-                if self._ready and not self._deferred:
+                if not self._deferred:
                     self._deferred = True
                     self.context.schedule(self.context.now_ns, self._go_on)
                 return
@@ -218,6 +216,9 @@ class Executor(Spinner):
 
     def _next(self) -> Work | None:
         ready = self._ready
+        first = ready[0]
+        if first.alive and (first.resumed or first.entity.callback_group.can_execute()):
+            return ready.popleft()
         while ready and not ready[0].alive:
             ready.popleft()
         for index, work in enumerate(ready):
@@ -258,7 +259,8 @@ class Executor(Spinner):
             segments, started = execution.segments, context.now_ns
             freed = None if suspended else group
             if not segments:
-                self._send(execution, started)
+                if execution.outbox:
+                    self._send(execution, started)
                 heapq.heappush(self._idle, worker)
                 if freed is not None:
                     freed.active -= 1
@@ -345,7 +347,7 @@ class Executor(Spinner):
             return False
         if not work.resumed:
             result = entity.execute(work)
-            if not inspect.iscoroutine(result):
+            if not isinstance(result, CoroutineType):
                 entity.complete(work, result)
                 return False
             coroutine = result
@@ -365,7 +367,7 @@ class Executor(Spinner):
                 fix="In a callback await client.call_async(...) or robotbrain.ros.sleep(node, seconds); "
                 "asyncio objects need asyncio's own loop.",
             )
-        group = entity.callback_group
+        group: CallbackGroup = entity.callback_group
         if awaited.completed_in is group and not group.can_execute():
             coroutine.throw(
                 ReentrancyError(

@@ -41,9 +41,9 @@ class Topic:
             return
         publisher.matched.append(subscription)
         _tell(publisher, subscription, 1)
-        if (handler := subscription.handlers.get("liveliness")) is not None:
-            if publisher.lease is None or publisher.lease.alive:
-                handler.add(alive_count=1)
+        handler = subscription.handlers.get("liveliness")
+        if handler is not None and (publisher.lease is None or publisher.lease.alive):
+            handler.add(alive_count=1)
 
     def _refuse(self, publisher: Publisher, subscription: Subscription, found: list[Mismatch]) -> None:
         last = found[-1].kind  # of several, the middleware reports the one with the highest id

@@ -140,7 +140,7 @@ class NodeGraph:
         def missing() -> bool:
             return wanted not in self.get_fully_qualified_node_names()
 
-        if missing() and self.context.running is None:
+        if missing() and not self.context.in_callback():
             try:
                 spin_while(self.context, missing, timeout, "wait_for_node")
             except SimulationDeadlockError:

@@ -14,7 +14,7 @@ _EXAMPLE = "planner:\n  ros__parameters:\n    rate: 5.0"
 
 def parse_value(text: str) -> Any:
     """Return a parameter value written as YAML; text that is no YAML is itself."""
-    import yaml
+    import yaml  # type: ignore[import-untyped]
 
     try:
         value = yaml.safe_load(text)

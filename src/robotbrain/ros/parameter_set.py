@@ -12,6 +12,7 @@ from robotbrain.ros.exceptions import (
     InvalidParameterTypeException,
     InvalidParameterValueException,
     ParameterAlreadyDeclaredException,
+    ParameterException,
     ParameterImmutableException,
     ParameterNotDeclaredException,
     ParameterUninitializedException,
@@ -45,7 +46,9 @@ class ParameterSet:
 
     # ------------------------------------------------------------ declaring
 
-    def declare(self, name: str, value: Any, descriptor: Any, ignore_override: bool, *, bare: bool = False) -> Parameter:
+    def declare(
+        self, name: Any, value: Any, descriptor: Any, ignore_override: bool, *, bare: bool = False
+    ) -> Parameter:
         """Declare one parameter; see ``Node.declare_parameter``. ``bare``: by nothing but its name."""
         if not isinstance(name, str) or not name:
             raise InvalidParameterException(
@@ -62,7 +65,7 @@ class ParameterSet:
         if descriptor is None:
             descriptor = wanted(dynamic_typing=bare)
         elif not isinstance(descriptor, wanted):
-            raise TypeError(f"the descriptor of parameter {name} is a {type(descriptor).__name__}, not {wanted.__name__}")
+            raise TypeError(f"the descriptor of {name} is a {type(descriptor).__name__}, not {wanted.__name__}")
         if isinstance(value, ParameterType):
             if value == ParameterType.NOT_SET or descriptor.dynamic_typing:
                 raise InvalidParameterValueException(
@@ -89,7 +92,7 @@ class ParameterSet:
         parameter = Parameter(name, kind if fits else None, value)
         result = self._apply([parameter], {name: descriptor}, declaring=True)
         if not result.successful:
-            problem = InvalidParameterValueException
+            problem: type[ParameterException] = InvalidParameterValueException
             if not descriptor.dynamic_typing and parameter.type_ not in (ParameterType.NOT_SET, kind):
                 problem = InvalidParameterTypeException
             raise problem(
@@ -166,7 +169,7 @@ class ParameterSet:
 
     def listed(self, prefixes: Sequence[str], depth: int) -> Any:
         """Return ``rcl_interfaces/msg/ListParametersResult``; see ``Node.list_parameters``."""
-        result = message_class("rcl_interfaces/msg/ListParametersResult")()
+        result: Any = message_class("rcl_interfaces/msg/ListParametersResult")()
         for name in self.values:
             # Depth counts names below the prefix; 0 means all.
             rests = [name] if not prefixes else [name[len(p) + 1 :] for p in prefixes if name.startswith(p + ".")]
@@ -187,9 +190,9 @@ class ParameterSet:
 
     # ------------------------------------------------------------ setting
 
-    def set(self, parameters: Iterable[Parameter]) -> Any:
+    def set(self, parameters: Iterable[Any]) -> Any:
         """Set all or none; return ``rcl_interfaces/msg/SetParametersResult``."""
-        chosen = list(parameters)
+        chosen: list[Any] = list(parameters)
         if self.pre_set:
             chosen = [parameter for callback in self.pre_set for parameter in callback(chosen)]
             if not chosen:
@@ -209,9 +212,10 @@ class ParameterSet:
                 reason = self._refusal(parameter, descriptor, check_read_only=not declaring)
                 if reason:
                     return _result(False, reason)
+        expected: Any = message_class("rcl_interfaces/msg/SetParametersResult")
         for callback in self.on_set:
             result = callback(parameters)
-            if not isinstance(result, message_class("rcl_interfaces/msg/SetParametersResult")):
+            if not isinstance(result, expected):
                 warnings.warn("Callback returned an invalid type, it should return SetParametersResult.", stacklevel=2)
                 return _result(False, "Callback returned an invalid type")
             if not result.successful:
@@ -266,11 +270,9 @@ class ParameterSet:
         elif kind == ParameterType.NOT_SET:
             return "Static parameter cannot be undeclared" if name in self.values else ""
         elif int(kind) != descriptor.type:
-            if not (descriptor.type >= ParameterType.BYTE_ARRAY and ParameterType(descriptor.type).check(parameter.value)):
-                return (
-                    f"Wrong parameter type, expected '{ParameterType(descriptor.type).name}' got '{kind.name}' "
-                    f"(parameter {name})"
-                )
+            wanted = ParameterType(descriptor.type)
+            if wanted < ParameterType.BYTE_ARRAY or not wanted.check(parameter.value):
+                return f"Wrong parameter type, expected '{wanted.name}' got '{kind.name}' (parameter {name})"
         if kind == ParameterType.INTEGER and descriptor.integer_range:
             return _outside(parameter, descriptor.integer_range[0], exact=True)
         if kind == ParameterType.DOUBLE and descriptor.floating_point_range:

@@ -290,9 +290,7 @@ def best_available(qos: QoSProfile, others: Sequence[QoSProfile], *, offers: boo
         if getattr(qos, name).nanoseconds == BEST_AVAILABLE_NS:
             limits = [limit_ns(getattr(other, name)) for other in others]
             known = [limit for limit in limits if limit is not None]
-            if offers:
-                best = min(known, default=None)
-            else:
-                best = max(known) if known and len(known) == len(limits) else None
+            shared = max(known) if known and len(known) == len(limits) else None
+            best = min(known, default=None) if offers else shared
             setattr(result, name, Duration(nanoseconds=best or 0))
     return result

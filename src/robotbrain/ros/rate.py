@@ -41,7 +41,7 @@ class Rate:
             raise RuntimeError("Rate cannot sleep because it has been destroyed")
         if self._timer.destroyed:
             raise InvalidHandle("Rate cannot sleep because the timer has been destroyed")
-        if context.running is not None:
+        if context.in_callback():
             raise ReentrancyError(
                 "rate.sleep() was called inside a callback, which keeps the thread that would tick the rate: do one "
                 "round per call of create_timer(period, callback), or write an async def callback with "

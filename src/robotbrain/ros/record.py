@@ -11,7 +11,6 @@ from types import TracebackType
 from robotbrain.files import write_bytes
 from robotbrain.ros.context import SimContext
 
-
 SYSTEM = frozenset({"/parameter_events", "/rosout"})
 """Topics on which nodes publish of themselves, when somebody listens."""
 

@@ -37,7 +37,7 @@ class Patience:
         Raises:
             SimulationDeadlockError: with ``never()`` as its text: waited without limit, or 100 times in vain.
         """
-        if not ready() and self._node.context.running is None:
+        if not ready() and not self._node.context.in_callback():
             try:
                 spin_while(self._node.context, lambda: not ready(), timeout_sec, what)
             except SimulationDeadlockError:
@@ -252,7 +252,7 @@ class Client(Entity):
             ReentrancyError: inside a callback, where genuine rclpy deadlocks.
             TimeoutError: no answer in time.
         """
-        if self.node.context.running is not None:
+        if self.node.context.in_callback():
             raise ReentrancyError(
                 f"client.call({self.srv_name}) inside a callback waits for an answer that can only come after the "
                 "callback returns (genuine rclpy deadlocks): use future = client.call_async(request) and "

@@ -30,6 +30,8 @@ RCLPY_MODULES: dict[str, str] = {
     "rclpy.event_handler": "event_handler",
     "rclpy.exceptions": "exceptions",
     "rclpy.executors": "executors",
+    "rclpy.experimental": "experimental",
+    "rclpy.experimental.events_executor": "experimental",
     "rclpy.guard_condition": "guard_condition",
     "rclpy.logging": "logging",
     "rclpy.node": "node",
@@ -37,14 +39,14 @@ RCLPY_MODULES: dict[str, str] = {
     "rclpy.parameter_client": "parameter_client",
     "rclpy.parameter_event_handler": "parameter_event_handler",
     "rclpy.parameter_service": "parameter_service",
-    "rclpy.publisher": "topics",
+    "rclpy.publisher": "publisher",
     "rclpy.qos": "qos",
     "rclpy.qos_event": "event_handler",
     "rclpy.qos_overriding_options": "qos_overriding_options",
     "rclpy.serialization": "serialization",
     "rclpy.service": "services",
     "rclpy.signals": "signals",
-    "rclpy.subscription": "topics",
+    "rclpy.subscription": "subscription",
     "rclpy.task": "task",
     "rclpy.time": "time",
     "rclpy.timer": "timer",
@@ -54,17 +56,24 @@ RCLPY_MODULES: dict[str, str] = {
 }
 """Module of rclpy -> module of ``robotbrain.ros`` whose public names it shows."""
 
-MODULES: dict[str, str] = {**RCLPY_MODULES, **TF2_MODULES}
+MODULES: dict[str, str] = {**RCLPY_MODULES, **TF2_MODULES, "message_filters": "message_filters"}
 """All modules that are shown under another name."""
 
 _EXTRA_NAMES: dict[str, dict[str, str]] = {
     "rclpy.clock": {"ClockType": "time"},
-    "rclpy.context": {"Context": "context:SimContext"},
     "rclpy.executors": {"ExternalShutdownException": "executors"},
     "rclpy.logging": {},
     "rclpy.node": {"Parameter": "parameter"},
-    "rclpy": {"Context": "context:SimContext", "Node": "node", "Parameter": "parameter"},
+    "rclpy": {
+        "Context": "context",
+        "Node": "node",
+        "Parameter": "parameter",
+        "get_rmw_implementation_identifier": "utilities",
+    },
 }
+
+
+_KINDS = ("", "msg", "srv", "action")
 
 
 class KitFinder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
@@ -77,7 +86,7 @@ class KitFinder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         if fullname in MODULES:
             return importlib.machinery.ModuleSpec(fullname, self, is_package=_is_package(fullname))
         package, _, kind = fullname.partition(".")
-        if kind not in ("", "msg", "srv", "action") or not package.endswith(("_msgs", "_srvs", "_interfaces", "_common")):
+        if kind not in _KINDS or not package.endswith(("_msgs", "_srvs", "_interfaces", "_common")):
             return None
         from robotbrain.ros.typedefs import packages, typenames
 
@@ -140,9 +149,7 @@ def _fill_interfaces(module: types.ModuleType) -> None:
         elif key in services and is_service(prefix + key):
             value = service_class(prefix + key)
         else:
-            raise AttributeError(
-                f"{module.__name__} has no {key!r}; it has: {', '.join(actions or services or names)}"
-            )
+            raise AttributeError(f"{module.__name__} has no {key!r}; it has: {', '.join(actions or services or names)}")
         setattr(module, key, value)
         return value
 

@@ -47,12 +47,17 @@ class Spinner:
     def spin(self) -> None:
         """Run the simulation until shutdown, until its horizon, or until nothing is left to happen.
 
+        In a second thread it leaves the running to the first one (see :mod:`robotbrain.ros.threads`).
+
         Raises:
             ExternalShutdownException: the horizon was reached (as Ctrl-C in genuine rclpy).
         """
         context = self.context
         context.check_not_in_callback("spin")
+        second = context.simulated and not context.driver.is_mine()
         while context.ok() and not self._is_shutdown:
+            if second and not context.driver.give_way(context):
+                return
             upcoming = context.next_event_ns()
             if upcoming is None:
                 context.get_logger().info("spin: no event is pending, so nothing can happen any more; shutting down")

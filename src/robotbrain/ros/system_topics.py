@@ -1,7 +1,7 @@
 """``/parameter_events`` and ``/rosout``: topics on which every node publishes, once somebody listens.
 
-Nodes get their publishers when the first subscription is made. Without one nothing is sent, so a run that nobody watches
-pays nothing for them and looks the same.
+Nodes get their publishers when the first subscription is made. Without one nothing is sent, so a run that nobody
+watches pays nothing for them and looks the same.
 """
 
 from __future__ import annotations

@@ -28,12 +28,10 @@ def seconds_to_ns(seconds: float) -> int:
     Raises:
         InputError: not a number.
     """
-    try:
-        return int(seconds * NS_PER_S)
-    except TypeError:
-        raise InputError(
-            "seconds", given=seconds, expected="a number", fix="Text is converted with float(...)."
-        ) from None
+    given: Any = seconds
+    if isinstance(given, (str, bytes)):
+        raise InputError("seconds", given=given, expected="a number", fix="Convert it with float(...).")
+    return int(given * NS_PER_S)
 
 
 def _message_ns(msg: Any, typename: str) -> int:

@@ -20,6 +20,10 @@ if TYPE_CHECKING:
     from robotbrain.ros.node import Node
 
 
+class TimerPeriodError(InputError, RuntimeError):
+    """A timer's period is no time > 0 (genuine rclpy raises a RuntimeError, and lets 0 spin)."""
+
+
 class TimerInfo:
     """When a timer's call was due and when it came; given to callbacks with a parameter annotated ``TimerInfo``.
 
@@ -190,7 +194,7 @@ def period_sec_to_ns(period_sec: float) -> int:
     except (TypeError, ValueError, OverflowError):
         period_ns = 0
     if period_ns <= 0:
-        raise InputError(
+        raise TimerPeriodError(
             "timer period", given=period_sec, expected="seconds > 0", fix="20 Hz is create_timer(0.05, callback)."
         )
     return period_ns

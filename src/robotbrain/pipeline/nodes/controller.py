@@ -14,7 +14,7 @@ from sensor_msgs.msg import LaserScan, PointCloud2
 from robotbrain.pipeline.control import ControlParams, PathTracker
 from robotbrain.pipeline.geometry import Pose, inverse, transform
 from robotbrain.pipeline.nodes.perception import FLOOR_LABEL
-from robotbrain.pipeline.nodes.poses import StampedPoses, check_finite
+from robotbrain.pipeline.nodes.poses import FrameCheck, StampedPoses, check_finite
 from robotbrain.ros import charge_work
 from robotbrain.ros.conversions import cloud_to_points, path_to_numpy, quaternion_to_yaw, scan_to_arrays, time_to_ns
 
@@ -46,7 +46,8 @@ class ControllerNode(Node):
     def __init__(self, params: ControlParams | None = None) -> None:
         super().__init__("controller")
         self._tracker = PathTracker(params)
-        self._poses = StampedPoses()
+        self._frames = FrameCheck(self)
+        self._poses = StampedPoses(frames=self._frames)
         self._path: NDArray[np.float64] = np.zeros((0, 2))
         self._final_yaw: float | None = None
         self._scan: _Sighting | None = None
@@ -66,6 +67,8 @@ class ControllerNode(Node):
         self._final_yaw = quaternion_to_yaw(msg.poses[0].pose.orientation) if len(msg.poses) == 1 else None
 
     def _on_scan(self, msg: LaserScan) -> None:
+        if not self._frames.sensor("scan", msg):
+            return
         ranges, angles = scan_to_arrays(msg)
         # REP 117: -inf is too near to measure, +inf no return, NaN an error; none of them is a place.
         near = np.isfinite(ranges) & (ranges < 2.0)
@@ -79,6 +82,8 @@ class ControllerNode(Node):
         self._poses.when_known(stamp, keep)
 
     def _on_points(self, msg: PointCloud2) -> None:
+        if not self._frames.expect("perception/points", msg, "base_link"):
+            return
         points = cloud_to_points(msg).astype(np.float64)
         local = points[points[:, 2] != FLOOR_LABEL, :2]
         local = thin_out(local[np.hypot(local[:, 0], local[:, 1]) < 1.5])

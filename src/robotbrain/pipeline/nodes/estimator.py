@@ -10,6 +10,7 @@ from sensor_msgs.msg import Imu, JointState, LaserScan
 
 from robotbrain.pipeline.estimation import PoseFilter, ScanMatcher
 from robotbrain.pipeline.geometry import Pose, PoseBuffer, wrap
+from robotbrain.pipeline.nodes.poses import FrameCheck
 from robotbrain.ros import charge_work
 from robotbrain.ros.conversions import ns_to_time, scan_to_arrays, time_to_ns, yaw_to_quaternion
 
@@ -29,6 +30,7 @@ class EstimatorNode(Node):
     def __init__(self, wheel_radius: float = 0.06, track: float = 0.30) -> None:
         super().__init__("estimator")
         self._wheel_radius, self._track = wheel_radius, track
+        self._frames = FrameCheck(self)
         self._filter = PoseFilter()
         self._matcher = ScanMatcher()
         self._history = PoseBuffer()
@@ -42,6 +44,8 @@ class EstimatorNode(Node):
         self.create_subscription(LaserScan, "scan", self._on_scan, 2)
 
     def _on_imu(self, msg: Imu) -> None:
+        if not self._frames.sensor("imu", msg):
+            return
         self._gyro.append(float(msg.angular_velocity.z))
 
     def _on_wheels(self, msg: JointState) -> None:
@@ -65,6 +69,8 @@ class EstimatorNode(Node):
         charge_work("wheel_update", 1)
 
     def _on_scan(self, msg: LaserScan) -> None:
+        if not self._frames.sensor("scan", msg):
+            return
         stamp = time_to_ns(msg.header.stamp)
         guess = self._history.at(stamp)
         if guess is None:

@@ -13,7 +13,7 @@ from robotbrain.pipeline.grid import GridFrame
 from robotbrain.pipeline.mapping import OccupancyMapper
 from robotbrain.pipeline.nodes.grids import grid_to_msg
 from robotbrain.pipeline.nodes.perception import FLOOR_LABEL
-from robotbrain.pipeline.nodes.poses import StampedPoses
+from robotbrain.pipeline.nodes.poses import FrameCheck, StampedPoses
 from robotbrain.ros import charge_work
 from robotbrain.ros.conversions import cloud_to_points, scan_to_arrays, time_to_ns
 
@@ -27,7 +27,8 @@ class MapperNode(Node):
     def __init__(self) -> None:
         super().__init__("mapper")
         self._mapper = OccupancyMapper(GridFrame.centred(MAP_HALF_EXTENT, MAP_RESOLUTION))
-        self._poses = StampedPoses()
+        self._frames = FrameCheck(self)
+        self._poses = StampedPoses(frames=self._frames)
         self._publisher = self.create_publisher(
             OccupancyGrid, "map", QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         )
@@ -37,6 +38,8 @@ class MapperNode(Node):
         self.create_timer(0.5, self._publish)
 
     def _on_scan(self, msg: LaserScan) -> None:
+        if not self._frames.sensor("scan", msg):
+            return
         ranges, angles = scan_to_arrays(msg)
 
         def add(pose: Pose) -> None:
@@ -46,6 +49,8 @@ class MapperNode(Node):
         self._poses.when_known(time_to_ns(msg.header.stamp), add)
 
     def _on_points(self, msg: PointCloud2) -> None:
+        if not self._frames.expect("perception/points", msg, "base_link"):
+            return
         points = cloud_to_points(msg).astype(np.float64)
         floor = points[:, 2] == FLOOR_LABEL
 

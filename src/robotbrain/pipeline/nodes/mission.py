@@ -15,7 +15,7 @@ from std_msgs.msg import Bool
 from robotbrain.pipeline.exploration import MarkerTracker, ViewMemory
 from robotbrain.pipeline.geometry import Pose, transform
 from robotbrain.pipeline.nodes.grids import grid_from_msg
-from robotbrain.pipeline.nodes.poses import StampedPoses, check_finite
+from robotbrain.pipeline.nodes.poses import FrameCheck, StampedPoses, check_finite
 from robotbrain.ros import charge_work
 from robotbrain.ros.conversions import numpy_to_path, time_to_ns, yaw_to_quaternion
 
@@ -45,7 +45,8 @@ class MissionNode(Node):
     def __init__(self, replan_after: float = REPLAN_AFTER) -> None:
         super().__init__("mission")
         self._replan_after = replan_after
-        self._poses = StampedPoses()
+        self._frames = FrameCheck(self)
+        self._poses = StampedPoses(frames=self._frames)
         self._marker = MarkerTracker()
         self._views: ViewMemory | None = None
         self._occupancy: NDArray[np.int8] | None = None
@@ -76,6 +77,8 @@ class MissionNode(Node):
         charge_work("map_read", self._occupancy.size)
 
     def _on_marker(self, msg: PointStamped) -> None:
+        if not self._frames.expect("perception/marker", msg, "base_link"):
+            return
         seen = np.array([msg.point.x, msg.point.y])
         check_finite("perception/marker", seen)
         # Where the robot was when the image was taken, not where it is now that the network has answered.

@@ -3,10 +3,11 @@
 As in ROS 2 an action is three services and two topics: ``NAME/_action/send_goal``, ``cancel_goal`` and ``get_result``,
 ``NAME/_action/feedback`` and ``status``; traces, bags, taps and bridges see them under these names.
 
-Executing a goal takes simulated time only where it says so. A plain execute callback is one piece of work: it costs what
-it charges, its feedback leaves when it is over, and it never sees a cancel request that comes meanwhile. A loop over
-stages is written ``async def`` with ``await`` of a future (``await robotbrain.ros.sleep(node, 0.5)``, say): it hands back
-the thread, feedback leaves at once, and cancel requests arrive between the stages. That form runs on genuine rclpy too.
+Executing a goal takes simulated time only where it says so. A plain execute callback is one piece of work: it costs
+what it charges, its feedback leaves when it is over, and it never sees a cancel request that comes meanwhile. A loop
+over stages is written ``async def`` with ``await`` of a future (``await robotbrain.ros.sleep(node, 0.5)``, say): it
+hands back the thread, feedback leaves at once, and cancel requests arrive between the stages. That form runs on genuine
+rclpy too.
 """
 
 from __future__ import annotations

@@ -142,7 +142,7 @@ class ActionClient:
         if not isinstance(goal, self._action_type.Goal):
             raise TypeError(
                 f"send_goal to {self._action_name}: expected a {self.typename} Goal, got "
-                f"{getattr(goal, '__msgtype__', type(goal).__name__)}; build it with {self._action_type.__name__}.Goal()"
+                f"{getattr(goal, '__msgtype__', type(goal).__name__)}: use {self._action_type.__name__}.Goal()"
             )
         goal_id = goal_uuid if goal_uuid is not None else self._new_goal_id()
         if feedback_callback is not None:
@@ -175,11 +175,11 @@ class ActionClient:
 
     def _wait_for(self, future: Future, what: str) -> Any:
         context = self._node.context
-        if context.running is not None:
+        if context.in_callback():
             raise ReentrancyError(
                 f"{what} on {self._action_name} inside a callback waits for an answer that can only come after the "
-                "callback returns (genuine rclpy deadlocks): use the ..._async form with add_done_callback, or 'await' it "
-                "in an async def callback"
+                "callback returns (genuine rclpy deadlocks): use the ..._async form with add_done_callback, or 'await' "
+                "it in an async def callback"
             )
         spin_while(context, future._pending, None, what)
         return future.result()
@@ -202,9 +202,7 @@ class ActionClient:
 
     def _get_result_async(self, handle: ClientGoalHandle) -> Future:
         self._check_handle(handle)
-        future = self._result_client.call_async(
-            self._action_type.Impl.GetResultService.Request(goal_id=handle.goal_id)
-        )
+        future = self._result_client.call_async(self._action_type.Impl.GetResultService.Request(goal_id=handle.goal_id))
         key = goal_key(handle.goal_id)
         future.add_done_callback(lambda _: self._feedback_callbacks.pop(key, None))
         return future

@@ -1,0 +1,425 @@
+"""Where did the time between a sensor and a command go? The chain of causes behind each, in pieces that add up.
+
+Going back from a message, each piece of time has one cause:
+
+- ``execution`` on a resource; ``contention``: a core, the GPU or a DLA was shared with, or taken by, somebody else;
+- ``queueing``: a ready callback waited for its executor's thread or for its callback group;
+- ``transport`` from publisher to subscription; ``sensor``: from the stamp of a measurement to its publication;
+- ``sampling``: a value lay in the node until the timer that uses it fired (or until the message it is joined with
+  came); ``holding``: it had been used before and was used again, because no newer one had come;
+- ``superseded``: this measurement was overwritten or dropped on its way; the command reflects a newer one.
+
+Two views of end-to-end latency (Feiertag et al. 2009; Günzel et al., "Timing Analysis of Asynchronized Distributed
+Cause-Effect Chains", RTAS 2021):
+
+- ``age``, one path per command: how old are the newest measurements behind it (data age, the immediate backward chain);
+- ``reaction``, one path per measurement: how long until a command reflects it or a newer one (the forward chain).
+
+What a callback knows: the message that set it off, and the newest message of every other topic of its node whose
+callback had ended. That holds for nodes of anybody; a node that ignores an input seems to know more than it does.
+"""
+
+from __future__ import annotations
+
+import bisect
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+from robotbrain.errors import InputError
+from robotbrain.monitoring.critical_path_blame import Occupancy, Place, place_of
+from robotbrain.monitoring.critical_path_device import Piece, lay_out
+
+if TYPE_CHECKING:
+    from robotbrain.monitoring.trace import Trace
+    from robotbrain.ros.context import CallbackRecord, MessageRecord
+
+__all__ = ["CAUSES", "Chains", "Path", "Place", "Span", "View", "critical_paths"]
+
+View = Literal["age", "reaction"]
+
+CAUSES = ("execution", "contention", "queueing", "transport", "sensor", "sampling", "holding", "superseded")
+"""What a piece of latency can be due to."""
+
+FEWEST = 3
+"""A topic with fewer messages than this in a trace is taken for a setting, not for a sensor."""
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """A piece of a path.
+
+    Attributes:
+        cause: one of CAUSES.
+        place: the callback that ran or waited; for ``transport`` and ``sensor`` that which took the message.
+        resource: ``cpu``, ``gpu``, …; ``executor 2``; the topic of a transport, sensor, sampling or superseding.
+        by: whose work was waited for, if that is known.
+        begin_ns, end_ns: simulated time.
+        callback: id of the callback's record.
+    """
+
+    cause: str
+    place: Place
+    resource: str
+    by: Place | None
+    begin_ns: int
+    end_ns: int
+    callback: int = 0
+
+    @property
+    def length_ns(self) -> int:
+        """Its length, ns."""
+        return self.end_ns - self.begin_ns
+
+
+@dataclass(frozen=True, slots=True)
+class Path:
+    """The chain between one measurement and one message of the sink.
+
+    Attributes:
+        source: topic of the measurement.
+        message: id of the sink's message.
+        origin_ns: time of the measurement: its stamp, or when it was published if it has none.
+        end_ns: when the sink's message left.
+        spans: without gaps, from ``origin_ns`` to ``end_ns``.
+    """
+
+    source: str
+    message: int
+    origin_ns: int
+    end_ns: int
+    spans: tuple[Span, ...] = field(repr=False)
+
+    @property
+    def latency_ns(self) -> int:
+        """End-to-end latency, ns: exactly the sum of the spans."""
+        return self.end_ns - self.origin_ns
+
+
+class _Origin(NamedTuple):
+    """The newest measurement behind a callback, and the earlier callback that knew it (0: its own message)."""
+
+    origin_ns: int
+    state: int
+
+
+class Chains:
+    """Everything that led to the messages of one sink.
+
+    Args:
+        trace: of a run.
+        sink: topic, or service whose answers are followed.
+        sources: topics of measurements; None: what reaches the sink from nodes that take the sink's messages (the
+            robot's driver), from nodes without inputs, or from outside any callback.
+
+    Raises:
+        InputError: for a sink without messages or sources that do not reach it.
+    """
+
+    def __init__(self, trace: Trace, sink: str = "/cmd_vel", sources: Sequence[str] | None = None) -> None:
+        self.trace, self.sink = trace, sink
+        topics = [message for message in trace.messages if message.name == sink and message.kind == "topic"]
+        answers = [message for message in trace.messages if message.name == sink and message.kind == "response"]
+        self.sinks = topics or answers
+        if not self.sinks:
+            names = sorted({message.name for message in trace.messages if message.kind != "request"})
+            raise InputError(
+                "sink", given=sink, expected="a topic or service of the trace: " + ", ".join(names), fix="Name one."
+            )
+        self._known = {record.id: record for record in trace.callbacks}
+        # What the robot measures is where chains begin, asked for or not: else they would run on through its motion.
+        self._source_topics = self._find_sources() | set(sources or ())
+        self._origins: dict[int, dict[str, _Origin]] = {}
+        self._reached: dict[tuple[Place, str], set[int]] = {}
+        self._trace_origins()
+        reach = self._reaching()
+        if sources is not None and (missing := [topic for topic in sources if topic not in reach]):
+            raise InputError(
+                "sources",
+                given=missing,
+                expected=f"topics behind {sink}: {', '.join(sorted(reach)) or 'none found'}",
+                fix="Leave sources out to see all of them.",
+            )
+        if not reach:
+            raise InputError(
+                "sources",
+                given=f"a trace in which nothing measured leads to {sink}",
+                expected="a chain of messages from a sensor",
+                fix="Name the topics to start from: sources=['/scan'].",
+            )
+        self.sources = tuple(sorted(reach if sources is None else set(sources)))
+
+    # ------------------------------------------------------------ what is behind each callback
+
+    def _find_sources(self) -> set[str]:
+        trace = self.trace
+        takes = {record.node for message in self.sinks for record in trace.takers.get(message.id, ())}
+        fed = {record.node for record in trace.callbacks if record.message}
+        count: dict[str, int] = {}
+        for message in trace.messages:
+            sender = trace.sender.get(message.id)
+            outside = sender is None or sender.node in takes or sender.node not in fed
+            if outside and message.kind == "topic" and message.name != self.sink:
+                count[message.name] = count.get(message.name, 0) + 1
+        return {topic for topic, messages in count.items() if messages >= FEWEST}
+
+    def origin_ns(self, message: MessageRecord) -> int:
+        """Return when what a source's message describes was measured: its stamp, unless that lies in the future."""
+        stamp = self.trace.stamps.get(message.id, 0)
+        return stamp if 0 < stamp <= message.released_ns else message.released_ns
+
+    def _trace_origins(self) -> None:
+        inputs: dict[str, dict[Place, list[CallbackRecord]]] = {}
+        for record in self.trace.callbacks:
+            here: dict[str, _Origin] = {}
+            message = self.trace.message_by_id.get(record.message)
+            if message is not None:
+                for topic, origin in self.behind(message).items():
+                    here[topic] = _Origin(origin, 0)
+            triggered = set(here)
+            mine = place_of(record)
+            if record.published or record.kind == "timer":
+                for place, earlier in inputs.get(record.node, {}).items():
+                    if place == mine:
+                        continue
+                    last = next((other for other in reversed(earlier) if other.end_ns <= record.start_ns), None)
+                    for topic, found in self._origins[last.id].items() if last is not None else ():
+                        if topic in triggered:
+                            continue
+                        known = here.get(topic)
+                        if known is None or found.origin_ns >= known.origin_ns:
+                            here[topic] = _Origin(found.origin_ns, last.id if last is not None else 0)
+            self._origins[record.id] = here
+            for topic, found in here.items():
+                self._reached.setdefault((mine, topic), set()).add(found.origin_ns)
+            if record.message:
+                inputs.setdefault(record.node, {}).setdefault(mine, []).append(record)
+
+    def behind(self, message: MessageRecord) -> Mapping[str, int]:
+        """Return the time of the newest measurement of each source behind a message, ns."""
+        if message.kind == "topic" and message.name in self._source_topics:
+            return {message.name: self.origin_ns(message)}
+        sender = self.trace.sender.get(message.id)
+        if sender is None:
+            return {}
+        return {topic: found.origin_ns for topic, found in self._origins.get(sender.id, {}).items()}
+
+    def _reaching(self) -> set[str]:
+        return {topic for message in self.sinks for topic in self.behind(message)}
+
+    # ------------------------------------------------------------ paths
+
+    @cached_property
+    def pieces(self) -> Mapping[int, tuple[Piece, ...]]:
+        """When each piece of each callback ran, by callback id."""
+        return lay_out(self.trace)
+
+    @cached_property
+    def _workers(self) -> Occupancy:
+        return Occupancy((r.executor, r.start_ns, r.end_ns, place_of(r)) for r in self.trace.callbacks)
+
+    @cached_property
+    def _resources(self) -> Occupancy:
+        return Occupancy(
+            (piece.resource, piece.served_from_ns, piece.end_ns, place_of(record))
+            for record in self.trace.callbacks
+            for piece in self.pieces[record.id]
+        )
+
+    @cached_property
+    def _starts(self) -> Mapping[Place, tuple[list[int], list[CallbackRecord]]]:
+        found: dict[Place, tuple[list[int], list[CallbackRecord]]] = {}
+        for record in self.trace.callbacks:
+            starts, records = found.setdefault(place_of(record), ([], []))
+            starts.append(record.start_ns)
+            records.append(record)
+        return found
+
+    def path(self, message: MessageRecord, source: str) -> Path | None:
+        """Return the path to a message from the newest measurement of ``source`` behind it; None without one."""
+        origin = self.behind(message).get(source)
+        if origin is None:
+            return None
+        spans: list[Span] = []
+        end = message.released_ns
+        record = self.trace.sender.get(message.id)
+        while record is not None:
+            mine, state = place_of(record), self._origins[record.id][source].state
+            spans.extend(self._running(record))
+            if state:
+                before = self._known[state]
+                spans.extend(self._waiting(record, max(before.end_ns, min(record.ready_ns, record.start_ns))))
+                spans.extend(self._sampling(record, before))
+                record = before
+                continue
+            spans.extend(self._waiting(record, record.ready_ns))
+            taken = self.trace.message_by_id[record.message]
+            spans.append(Span("transport", mine, taken.name, None, taken.released_ns, record.ready_ns, record.id))
+            if taken.kind == "topic" and taken.name in self._source_topics:
+                measured = self.origin_ns(taken)
+                spans.append(Span("sensor", mine, taken.name, None, measured, taken.released_ns))
+                break
+            record = self.trace.sender.get(taken.id)
+        return Path(source, message.id, origin, end, tuple(span for span in reversed(spans) if span.length_ns))
+
+    def _running(self, record: CallbackRecord) -> Iterator[Span]:
+        """Yield the spans of a callback that runs, the last first."""
+        mine = place_of(record)
+        for piece in reversed(self.pieces[record.id]):
+            served = piece.end_ns - piece.demand_ns
+            yield Span("execution", mine, piece.resource, None, served, piece.end_ns, record.id)
+            if served > piece.arrived_ns:
+                yield from self._contended(record, piece, served)
+
+    def _contended(self, record: CallbackRecord, piece: Piece, served: int) -> Iterator[Span]:
+        mine, taken = place_of(record), self._resources
+        if piece.resource == "cpu":
+            # Cores are shared all the time; the time lost is drawn before the time used, in proportion to the others'.
+            others = taken.shares(piece.resource, piece.arrived_ns, piece.end_ns, mine)
+            total, last = sum(time for _, time in others), served
+            for place, time in reversed(others[1:]):
+                begin = last - (served - piece.arrived_ns) * time // total
+                if begin < last:
+                    yield Span("contention", mine, piece.resource, place, begin, last, record.id)
+                last = begin
+            first_of_all = others[0][0] if others else None
+            yield Span("contention", mine, piece.resource, first_of_all, piece.arrived_ns, last, record.id)
+            return
+        for first, last, by in reversed(taken.between(piece.resource, piece.arrived_ns, served, "")):
+            yield Span("contention", mine, piece.resource, by, first, last, record.id)
+
+    def _waiting(self, record: CallbackRecord, since_ns: int) -> Iterator[Span]:
+        """Yield the spans of a callback that is ready but not started, the last first."""
+        mine, resource = place_of(record), f"executor {record.executor}"
+        for first, last, by in reversed(self._workers.between(record.executor, since_ns, record.start_ns, record.node)):
+            yield Span("queueing", mine, resource, by, first, last, record.id)
+
+    def _sampling(self, record: CallbackRecord, before: CallbackRecord) -> Iterator[Span]:
+        """Yield the spans of a value that lies in a node until a callback uses it, the last first."""
+        begin, end = before.end_ns, max(before.end_ns, min(record.ready_ns, record.start_ns))
+        mine, topic = place_of(record), before.name
+        starts, records = self._starts[mine]
+        first = records[bisect.bisect_left(starts, begin)]
+        used = min(end, max(begin, first.ready_ns)) if first.id != record.id else end
+        yield Span("holding", mine, topic, None, used, end, record.id)
+        yield Span("sampling", mine, topic, None, begin, used, record.id)
+
+    # ------------------------------------------------------------ views
+
+    def ages(self, source: str | None = None) -> tuple[Path, ...]:
+        """Return the path to each message of the sink: from ``source``, or from the source that is oldest then.
+
+        Messages behind which not all sources are yet are left out.
+        """
+        found = []
+        for message in self.sinks:
+            behind = {topic: origin for topic, origin in self.behind(message).items() if topic in self.sources}
+            if len(behind) < len(self.sources):
+                continue
+            # The name decides between sources of one age, so that the choice does not flutter.
+            topic = source or min(behind, key=lambda name: (behind[name], name))
+            path = self.path(message, topic)
+            if path is not None:
+                found.append(path)
+        return tuple(found)
+
+    def reactions(self, source: str) -> tuple[Path, ...]:
+        """Return the path of each measurement of ``source`` to the first message of the sink that reflects it.
+
+        Measurements that nothing reflected before the trace ended are left out.
+        """
+        steps: list[tuple[int, MessageRecord]] = []
+        for message in self.sinks:
+            origin = self.behind(message).get(source)
+            if origin is not None and (not steps or origin > steps[-1][0]):
+                steps.append((origin, message))
+        origins = [origin for origin, _ in steps]
+        paths: dict[int, Path] = {}
+        found = []
+        for message in self.trace.messages:
+            if message.name != source or message.kind != "topic":
+                continue
+            origin = self.origin_ns(message)
+            place = bisect.bisect_left(origins, origin)
+            if place == len(steps):
+                continue
+            sink = steps[place][1]
+            path = paths.get(sink.id)
+            if path is None:
+                built = self.path(sink, source)
+                assert built is not None
+                path = paths[sink.id] = built
+            if origin < path.origin_ns:
+                lost = Span("superseded", self._lost(path, origin), source, None, origin, path.origin_ns)
+                path = Path(source, sink.id, origin, path.end_ns, (lost, *path.spans))
+            found.append(path)
+        return tuple(found)
+
+    def _lost(self, path: Path, origin_ns: int) -> Place:
+        """Return the first callback on a path that an older measurement did not get to."""
+        places = list(dict.fromkeys(span.place for span in path.spans))
+        for place in places:
+            if origin_ns not in self._reached.get((place, path.source), ()):
+                return place
+        return places[-1]
+
+    @cached_property
+    def slowest_source(self) -> str:
+        """The source whose measurements take longest to show at the sink, by the median reaction.
+
+        A timer makes many sources equally slow; of those within 5 % it is the one with most work and waiting behind it.
+        """
+        medians = {source: _median(self.delays(source)) for source in self.sources}
+        worst = max(medians.values())
+        close = [source for source in self.sources if medians[source] >= 0.95 * worst]
+        if len(close) == 1:
+            return close[0]
+        return max(close, key=lambda source: (self._busy_ns(source), source))
+
+    def _busy_ns(self, source: str) -> int:
+        """Return the median, over the reactions of a source, of what is not spent lying in a node, ns."""
+        idle = ("sampling", "holding", "superseded")
+        return _median([sum(s.length_ns for s in p.spans if s.cause not in idle) for p in self.reactions(source)])
+
+    def delays(self, source: str) -> list[int]:
+        """Return the reactions of a source without building their paths, ns."""
+        steps: list[tuple[int, int]] = []
+        for message in self.sinks:
+            origin = self.behind(message).get(source)
+            if origin is not None and (not steps or origin > steps[-1][0]):
+                steps.append((origin, message.released_ns))
+        delays = []
+        for message in self.trace.messages:
+            if message.name == source and message.kind == "topic":
+                place = bisect.bisect_left(steps, (self.origin_ns(message), 0))
+                if place < len(steps):
+                    delays.append(steps[place][1] - self.origin_ns(message))
+        return delays
+
+
+def _median(values: Sequence[int]) -> int:
+    return sorted(values)[len(values) // 2] if values else -1
+
+
+def critical_paths(
+    trace: Trace, sink: str = "/cmd_vel", *, sources: Sequence[str] | None = None, view: View = "age"
+) -> tuple[Path, ...]:
+    """Return the causal chains behind a sink; see the module's description for the two views.
+
+    Args:
+        trace: of a run: ``drive(..., trace=True).trace``.
+        sink: topic, or service whose answers are followed.
+        sources: topics of measurements; None: found by themselves.
+        view: ``age``: a path for each message of the sink, from the source that is oldest behind it; ``reaction``: a
+            path for each measurement of the source that takes longest to show.
+
+    Raises:
+        InputError: for an unknown view or sink, or sources that do not lead there.
+    """
+    chains = Chains(trace, sink, sources)
+    if view == "age":
+        return chains.ages()
+    if view == "reaction":
+        return chains.reactions(chains.slowest_source)
+    raise InputError("view", given=view, expected="'age' or 'reaction'", fix="Choose one of the two.")

@@ -1,0 +1,193 @@
+"""Homework 3 itself: generated from its solution, its tests tested by named wrong solutions, its story true."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import nbformat
+import numpy as np
+import pytest
+
+from robotbrain.errors import InputError
+from robotbrain.grading import Suite, load_hidden_suite, mutation
+from robotbrain.grading.classroom import ClassResult, grade_class
+from robotbrain.grading.course import find_course, release_differences
+from robotbrain.grading.sample import load_mutants, make_class
+from robotbrain.grading.suites import hw3_performance_tools as tools
+from robotbrain.grading.suites import hw3_performance_traces as traces
+from robotbrain.grading.suites import hw3_performance_verdict as verdict
+from robotbrain.pipeline.inherited import BrainSetup, inherited_brain, unmet_requirements
+
+LAB = "hw3_performance"
+
+
+@pytest.fixture(scope="module")
+def suite(repo: Path) -> Suite:
+    return load_hidden_suite(LAB, repo / "autograder")
+
+
+def test_labs_is_what_solutions_generates(repo: Path, tmp_path: Path) -> None:
+    assert release_differences(find_course(repo), LAB, tmp_path) == []
+
+
+def test_the_released_lab_holds_no_answer_and_no_hidden_test(repo: Path) -> None:
+    text = (repo / "labs" / LAB / f"{LAB}.ipynb").read_text(encoding="utf-8")
+    for secret in (
+        "BEGIN SOLUTION",
+        "HIDDEN TESTS",
+        "hidden=True",
+        "np.isfinite(cost",
+        "binom.ppf(0.025, n, 0.5)))\\n",
+    ):
+        assert secret not in text
+    assert text.count("raise NotImplementedError()") >= 12
+
+
+def test_points_agree_between_notebook_and_tests(repo: Path, suite: Suite) -> None:
+    notebook = nbformat.read(repo / "solutions" / LAB / f"{LAB}.ipynb", as_version=4)
+    graded = [c for c in notebook.cells if c.metadata.get("nbgrader", {}).get("grade")]
+    automatic = sum(c.metadata.nbgrader.points for c in graded if c.cell_type == "code")
+    by_hand = sum(c.metadata.nbgrader.points for c in graded if c.cell_type == "markdown")
+    assert automatic == sum(e.points for e in suite.exercises.values()) == 90
+    assert by_hand == 10
+
+
+def test_every_hint_and_every_mutant_is_of_use(repo: Path, suite: Suite) -> None:
+    mutants, styles = load_mutants(find_course(repo), LAB)
+    assert len(mutants) >= 20 and len(styles) == 3
+    assert {m.hint for m in mutants} <= set(suite.hints)
+    assert {m.exercise for m in mutants} == set(suite.exercises)
+    files = [f"src/robotbrain/grading/suites/{LAB}{part}.py" for part in ("", "_tools", "_drives", "_verdict")]
+    tests = "".join((repo / name).read_text(encoding="utf-8") for name in [*files, f"autograder/hidden/{LAB}.py"])
+    assert [key for key in suite.hints if tests.count(f'"{key}"') < 2] == []
+
+
+# ---------------------------------------------------------------- the oracles against the kit's own watch
+
+
+@pytest.mark.parametrize("stage", ["size", "size+int8+threads"])
+def test_ages_and_chains_agree_with_what_the_kit_follows_by_stamps(stage: str) -> None:
+    run = traces.brain_run(stage)
+    assert run.trace is not None
+    count = len(run.camera_age_ms)
+    assert count > 40
+    assert tools.ages(run.trace)[-count:] == pytest.approx(run.camera_age_ms, abs=1e-6)
+    by_id = {c.id: c for c in run.trace.callbacks}
+    commands = [m for m in run.trace.messages if m.name == tools.COMMAND and m.id in run.trace.sender][-count:]
+    for command, age in list(zip(commands, run.camera_age_ms, strict=True))[::7]:
+        links = [by_id[number] for number in tools.chain(run.trace, command.id)]
+        assert [c.node for c in links] == ["/robot", "/perception", "/controller", "/controller"]
+        assert (links[-1].end_ns - links[0].end_ns) / 1e6 == pytest.approx(age, abs=1e-6)
+
+
+def test_utilisation_agrees_with_the_device() -> None:
+    run = traces.brain_run("size")
+    assert run.trace is not None
+    for name, share in tools.resource_use(run.trace).items():
+        # The device also counts the callback that was not over at the end.
+        assert share == pytest.approx(run.busy[name], abs=0.03)
+
+
+def test_planted_bottlenecks_are_found_by_the_rule() -> None:
+    rng = np.random.default_rng(0)
+    for cause in traces.PLANTS * 4:
+        for one_thread in (False, True):
+            trace, answer = traces.random_pipeline(rng, cause, one_thread=one_thread)
+            assert tools.bottleneck(trace) == answer
+            # Nothing planted lies near a threshold: a little more or less strictness changes no verdict.
+            assert tools.bottleneck(trace, full=0.85) == tools.bottleneck(trace, full=0.93) == answer
+            assert tools.bottleneck(trace, main=0.55) == tools.bottleneck(trace, main=0.75) == answer
+
+
+def test_the_median_interval_covers_the_median_as_often_as_it_says() -> None:
+    rng = np.random.default_rng(1)
+    hits = 0
+    for _ in range(400):
+        ratios = rng.lognormal(np.log(2.0), 0.6, 9)
+        before = [verdict.made_up_run(k, True, [100.0 * r]) for k, r in enumerate(ratios)]
+        after = [verdict.made_up_run(k, True, [100.0]) for k in range(9)]
+        low, high = verdict.verdict(before, after)["interval"]
+        hits += low <= 2.0 <= high
+    assert 0.93 <= hits / 400 <= 0.99  # exactly 96.1 % for nine pairs
+
+
+# ---------------------------------------------------------------- the patient
+
+
+def test_requirements_name_what_is_broken() -> None:
+    given = inherited_brain()
+    assert unmet_requirements(given) == []
+
+    def deployed(**changes: object) -> BrainSetup:
+        return replace(given, deployment=replace(given.deployment, **changes))  # type: ignore[arg-type]
+
+    assert unmet_requirements(deployed(image_size=(640, 480), precision="int8", camera_queue=1, one_thread=False)) == []
+    for broken, word in (
+        (deployed(image_size=(640, 320)), "image_size"),
+        (deployed(image_size=None), "image_size"),
+        (deployed(network=None), "network"),
+        (deployed(scan_rays=60), "scan_rays"),
+        (replace(given, module="agx-orin-64gb:MAXN"), "module"),
+        (replace(given, replan_after=5.0), "replan_after"),
+    ):
+        found = unmet_requirements(broken)
+        assert len(found) == 1 and found[0].startswith(word)
+    with pytest.raises(InputError, match="planner"):
+        replace(given, planner=3)  # type: ignore[arg-type]
+
+
+def test_what_the_homework_tells_about_the_patient_is_true(repo: Path) -> None:
+    stored = json.loads((repo / "autograder" / "reference" / f"{LAB}.json").read_text(encoding="utf-8"))
+    ill = traces.brain_run("inherited", seconds=stored["inherited"]["seconds"])
+    assert len(ill.e2e_ms) == stored["inherited"]["commands_built_on_an_image"] == 0
+    late = float(np.percentile(ill.perception_ms, 95))
+    assert late == pytest.approx(stored["inherited"]["image_to_points_p95_ms"], rel=0.02)
+    measured = tools.service_ms(traces.brain_trace("size+int8"), tools.PERCEPTION, tools.IMAGE, "gpu", 1.0)
+    assert measured == pytest.approx(stored["int8_after_size"]["perception_ms"], rel=0.02)
+    # The same brain has another bottleneck on another module, and each cure brings up the next.
+    nano, nx = "orin-nano-8gb:15W", "xavier-nx:15W"
+    assert tools.bottleneck(traces.brain_trace("inherited", nano)) == ("perception", "cpu")
+    assert tools.bottleneck(traces.brain_trace("size", nano)) == ("perception", "sharing")
+    assert tools.bottleneck(traces.brain_trace("inherited", nx, 8.0)) == ("perception", "gpu")
+    assert tools.bottleneck(traces.brain_trace("int8", nx)) == ("perception", "cpu")
+    assert tools.bottleneck(traces.brain_trace("size+int8", nx)) == ("perception", "sharing")
+    assert tools.bottleneck(traces.brain_trace("size+int8+threads", nx)) == ("", "none")
+
+
+# ---------------------------------------------------------------- the class
+
+
+@pytest.fixture(scope="module")
+def graded(repo: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[ClassResult, dict]:
+    out = tmp_path_factory.mktemp("class")
+    course = find_course(repo)
+    manifest = make_class(course, LAB, out / "class")
+    return grade_class(course, LAB, submitted=out / "class", out=out / "graded", workers=2), manifest
+
+
+@pytest.mark.timeout(1200)
+def test_every_mutant_loses_its_own_points_only_and_every_style_gets_all(graded: tuple[ClassResult, dict]) -> None:
+    result, manifest = graded
+    rows = mutation.judge(result.to_dict(), manifest)
+    assert len(rows) == len(manifest) >= 35
+    assert not [row for row in rows if row.problems], mutation.table(rows)
+
+
+def test_every_submission_ends_in_a_grade_and_a_feedback_page(graded: tuple[ClassResult, dict]) -> None:
+    result, manifest = graded
+    assert {row.student for row in result.rows} == set(manifest)
+    for row in result.rows:
+        pages = list((result.feedback / row.student / LAB).glob("*.html"))
+        assert len(pages) == 1, row.student
+        if row.verdict != "full":
+            assert row.reason(), row.student
+
+
+def test_hidden_tests_do_not_show_in_feedback(graded: tuple[ClassResult, dict]) -> None:
+    result, _ = graded
+    for row in result.rows:
+        page = next((result.feedback / row.student / LAB).glob("*.html")).read_text(encoding="utf-8")
+        for secret in ("student.rng", "_random_trace", "compare_ages", "autograder/hidden"):
+            assert secret not in page, f"{row.student}: {secret}"
