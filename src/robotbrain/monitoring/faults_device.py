@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from robotbrain.errors import InputError
-from robotbrain.monitoring.faults import Fault, Remover, Window, check_number
+from robotbrain.monitoring.faults_base import Fault, Remover, Window, check_number
 from robotbrain.ros.resources import RESOURCES
 
 if TYPE_CHECKING:

@@ -69,11 +69,11 @@ class _Instrument:
         for timer in list(node.timers):
             self.callback(timer, "timer", "")
         for service in list(node.services):
-            self.callback(service, "service", str(service.srv_name))
+            self.callback(service, "service", str(service.service_name))
         self.factory("create_publisher", self.publisher)
         self.factory("create_subscription", lambda made: self.callback(made, "subscription", _topic_of(made)))
         self.factory("create_timer", lambda made: self.callback(made, "timer", ""))
-        self.factory("create_service", lambda made: self.callback(made, "service", str(made.srv_name)))
+        self.factory("create_service", lambda made: self.callback(made, "service", str(made.service_name)))
 
     def undo(self) -> None:
         while self._undo:

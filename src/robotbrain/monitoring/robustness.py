@@ -17,6 +17,7 @@ from robotbrain.errors import InputError, RobotBrainError
 from robotbrain.files import write_text
 from robotbrain.monitoring.faults import (
     Blackout,
+    CpuHog,
     DropFrames,
     Fault,
     FrozenSensor,
@@ -24,10 +25,10 @@ from robotbrain.monitoring.faults import (
     Noise,
     Outliers,
     SensorBias,
+    Slowdown,
     StampOffset,
     WrongFrameId,
 )
-from robotbrain.monitoring.faults_device import CpuHog, Slowdown
 from robotbrain.monitoring.robustness_results import NOTHING, Robustness, Row, plain
 
 if TYPE_CHECKING:

@@ -3,60 +3,32 @@
 from __future__ import annotations
 
 import dataclasses
-import math
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 from robotbrain.errors import InputError
 from robotbrain.monitoring.critical_path_blame import Place
+from robotbrain.monitoring.whatif_change import EFFORTS, Change, Effort, check_positive, edit_stages
 from robotbrain.monitoring.whatif_model import Model, Stage
+from robotbrain.monitoring.whatif_settings import QueueDepth, SmallerMessages, TimerPhase, TimerRate
 from robotbrain.ros.resources import RESOURCES
 
-Effort = Literal["configuration", "hardware", "code"]
-"""What a change takes: a setting, other hardware or power, or work on the program."""
-
-EFFORTS: tuple[Effort, ...] = ("configuration", "hardware", "code")
-"""From little to much: of two changes that gain about the same, the easier one is named first."""
-
-
-@dataclass(frozen=True)
-class Change:
-    """Base of the changes.
-
-    ``takes`` says how much trouble it is; ``str(change)`` says it in words.
-    """
-
-    effort: ClassVar[Effort] = "configuration"
-
-    @property
-    def takes(self) -> Effort:
-        """What it takes: a setting, other hardware, or work on the code."""
-        return self.effort
-
-    def apply(self, model: Model) -> Model:
-        """Return the changed model.
-
-        Raises:
-            InputError: if the pipeline does not have what is to be changed.
-        """
-        raise NotImplementedError
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain data for JSON."""
-        return {"change": type(self).__name__, "text": str(self), **dataclasses.asdict(self)}
-
-
-def _positive(what: str, value: object, fix: str) -> None:
-    good = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value) and value > 0
-    if not good:
-        raise InputError(what, given=value, expected="a number > 0", fix=fix)
-
-
-def _stages(model: Model, chosen: Callable[[Stage], bool], edit: Callable[[Stage], Stage]) -> Model:
-    return dataclasses.replace(
-        model, stages={place: edit(stage) if chosen(stage) else stage for place, stage in model.stages.items()}
-    )
+__all__ = [
+    "EFFORTS",
+    "Change",
+    "Device",
+    "Effort",
+    "Faster",
+    "MoveTo",
+    "OwnExecutor",
+    "QueueDepth",
+    "SmallerMessages",
+    "Threads",
+    "TimerPhase",
+    "TimerRate",
+    "Together",
+    "Without",
+]
 
 
 @dataclass(frozen=True)
@@ -80,7 +52,7 @@ class Faster(Change):
     how: str = ""
 
     def __post_init__(self) -> None:
-        _positive("times", self.times, "2 is twice as fast.")
+        check_positive("times", self.times, "2 is twice as fast.")
         if self.resource is not None and self.resource not in RESOURCES:
             raise InputError(
                 "resource", given=self.resource, expected="one of " + ", ".join(RESOURCES), fix="Or None for all."
@@ -104,7 +76,7 @@ class Faster(Change):
                 scale[resource] = scale.get(resource, 1.0) / self.times
             return dataclasses.replace(stage, scale=scale)
 
-        return _stages(model, lambda stage: self.touches(stage.place), edit)
+        return edit_stages(model, lambda stage: self.touches(stage.place), edit)
 
     def __str__(self) -> str:
         where = f" on the {self.resource.upper()}" if self.resource else ""
@@ -136,7 +108,7 @@ class OwnExecutor(Change):
             if chosen and place.node not in own:
                 own[place.node] = max(threads) + 1
                 threads[own[place.node]] = 1
-        changed = _stages(
+        changed = edit_stages(
             model,
             lambda stage: stage.place.node in own,
             lambda stage: dataclasses.replace(stage, executor=own[stage.place.node]),
@@ -162,7 +134,7 @@ class Threads(Change):
     threads: int
 
     def __post_init__(self) -> None:
-        _positive("threads", self.threads, "2 is a first try.")
+        check_positive("threads", self.threads, "2 is a first try.")
 
     def apply(self, model: Model) -> Model:
         """Return the changed model."""
@@ -171,34 +143,6 @@ class Threads(Change):
 
     def __str__(self) -> str:
         return f"run {self.node} and those that share its executor on {self.threads} threads"
-
-
-@dataclass(frozen=True)
-class QueueDepth(Change):
-    """Let fewer or more messages wait for a subscription.
-
-    Attributes:
-        node, topic: of the subscription.
-        depth: messages that may wait, >= 1; the oldest makes way.
-    """
-
-    node: str
-    topic: str
-    depth: int = 1
-
-    def __post_init__(self) -> None:
-        _positive("depth", self.depth, "1 keeps the newest only.")
-
-    def apply(self, model: Model) -> Model:
-        """Return the changed model."""
-        chosen = model.stage(self.node, "subscription", self.topic).place
-        return _stages(
-            model, lambda stage: stage.place == chosen, lambda stage: dataclasses.replace(stage, depth=int(self.depth))
-        )
-
-    def __str__(self) -> str:
-        newest = "the newest message" if self.depth == 1 else f"the newest {self.depth} messages"
-        return f"let {self.node} keep only {newest} of {self.topic} (queue depth {self.depth})"
 
 
 @dataclass(frozen=True)
@@ -219,7 +163,7 @@ class MoveTo(Change):
     slower: float = 1.0
 
     def __post_init__(self) -> None:
-        _positive("slower", self.slower, "2 is twice as long.")
+        check_positive("slower", self.slower, "2 is twice as long.")
 
     def apply(self, model: Model) -> Model:
         """Return the changed model."""
@@ -236,7 +180,7 @@ class MoveTo(Change):
             scale = {**stage.scale, self.source: stage.scale.get(self.source, 1.0) * self.slower}
             return dataclasses.replace(stage, scale=scale, moved={**stage.moved, self.source: self.to})
 
-        return _stages(model, lambda stage: stage.place.node == self.node, edit)
+        return edit_stages(model, lambda stage: stage.place.node == self.node, edit)
 
     def __str__(self) -> str:
         cost = f", where it takes {self.slower:.3g} times as long" if self.slower != 1 else ""
@@ -262,7 +206,7 @@ class Device(Change):
 
     def __post_init__(self) -> None:
         for label, value in (("cores", self.cores or 1), ("cpu", self.cpu), ("gpu", self.gpu), ("dla", self.dla)):
-            _positive(label, value, "1 leaves it as it is.")
+            check_positive(label, value, "1 leaves it as it is.")
 
     def apply(self, model: Model) -> Model:
         """Return the changed model."""
@@ -282,116 +226,6 @@ class Device(Change):
             if value != 1
         ]
         return f"{self.name or 'other hardware'}: {', '.join(parts) or 'no difference'}"
-
-
-@dataclass(frozen=True)
-class TimerRate(Change):
-    """Let a timer fire more or less often.
-
-    Attributes:
-        node, timer: its node and the name of its callback.
-        hz: calls per second.
-    """
-
-    node: str
-    timer: str
-    hz: float
-
-    def __post_init__(self) -> None:
-        _positive("hz", self.hz, "20 is every 50 ms.")
-
-    def apply(self, model: Model) -> Model:
-        """Return the changed model."""
-        timer = _timer(model, self.node, self.timer)
-        period = round(1e9 / self.hz)
-        first = timer.first_ns - timer.period_ns + period
-        changed = dataclasses.replace(timer, period_ns=period, first_ns=first)
-        return _stages(model, lambda stage: stage is timer, lambda _: changed)
-
-    def __str__(self) -> str:
-        return f"run {self.node}'s timer {self.timer} at {self.hz:.3g} Hz"
-
-
-@dataclass(frozen=True)
-class TimerPhase(Change):
-    """Start a timer later, so that it fires just after its inputs have come.
-
-    Attributes:
-        node, timer: its node and the name of its callback.
-        later_ms: by how much, ms.
-    """
-
-    node: str
-    timer: str
-    later_ms: float
-
-    def __post_init__(self) -> None:
-        _positive("later_ms", self.later_ms, "Less than one period is enough.")
-
-    def apply(self, model: Model) -> Model:
-        """Return the changed model."""
-        timer = _timer(model, self.node, self.timer)
-        changed = dataclasses.replace(timer, first_ns=timer.first_ns + round(self.later_ms * 1e6))
-        return _stages(model, lambda stage: stage is timer, lambda _: changed)
-
-    def __str__(self) -> str:
-        return f"start {self.node}'s timer {self.timer} {self.later_ms:.3g} ms later, just after its inputs come"
-
-
-def _timer(model: Model, node: str, name: str) -> Stage:
-    timer = model.stage(node, "timer", name)
-    if not timer.period_ns:
-        raise InputError(
-            f"timer {name} of {node}",
-            given="no regular period in the trace",
-            expected="a timer that fires on a grid",
-            fix="Record for longer, or change another timer.",
-        )
-    return timer
-
-
-@dataclass(frozen=True)
-class SmallerMessages(Change):
-    """Shrink the messages of a topic: smaller images, thinner clouds.
-
-    Attributes:
-        topic: which.
-        left: share of the size that is left, e.g. 0.25.
-        work: share of the takers' time that goes by size, 0 to 1; None: fitted from the trace where sizes vary, or 1.
-    """
-
-    effort: ClassVar[Effort] = "code"
-    topic: str
-    left: float
-    work: float | None = None
-
-    def __post_init__(self) -> None:
-        _positive("left", self.left, "0.25 is a quarter.")
-        if self.work is not None and not 0 <= self.work <= 1:
-            raise InputError("work", given=self.work, expected="0 to 1", fix="Or None to fit it.")
-
-    def apply(self, model: Model) -> Model:
-        """Return the changed model."""
-        takers = [p for p in model.stages if p.kind == "subscription" and p.name == self.topic]
-        if not takers:
-            names = sorted({place.name for place in model.stages if place.kind == "subscription"})
-            raise InputError(
-                "topic", given=self.topic, expected="one of " + ", ".join(names), fix="Name one that is taken."
-            )
-
-        def edit(stage: Stage) -> Stage:
-            scale: dict[str, float] = dict(stage.scale)
-            for resource in RESOURCES:
-                share = stage.by_size(resource) if self.work is None else self.work
-                scale[resource] = scale.get(resource, 1.0) * (1 - share + share * self.left)
-            return dataclasses.replace(stage, scale=scale)
-
-        changed = _stages(model, lambda stage: stage.place in takers, edit)
-        sizes: Mapping[str, float] = {**model.sizes, self.topic: model.sizes.get(self.topic, 1.0) * self.left}
-        return dataclasses.replace(changed, sizes=sizes)
-
-    def __str__(self) -> str:
-        return f"make the messages on {self.topic} smaller, to {self.left:.0%} of their size"
 
 
 @dataclass(frozen=True)

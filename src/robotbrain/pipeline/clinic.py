@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robotbrain.errors import InputError
-from robotbrain.pipeline.geometry import inverse, transform, wrap, wrap_angle
+from robotbrain.pipeline.geometry import inverse, transform, wrap_angle
 from robotbrain.ros.context import SimContext
 from robotbrain.ros.qos import QoSProfile, ReliabilityPolicy
 
@@ -180,14 +180,3 @@ class Link:
             return self._free_ns - context.now_ns
 
         context.latency_ns = latency
-
-
-def mount_to_base(point: tuple[float, float], mount: tuple[float, float, float]) -> tuple[float, float]:
-    """Return a point of a sensor's frame in the robot's frame, m.
-
-    Args:
-        point: x, y in the sensor's frame, m.
-        mount: x, y, yaw of the sensor in the robot's frame, m and rad.
-    """
-    x, y = transform((mount[0], mount[1], wrap(mount[2])), np.asarray(point, dtype=float))
-    return float(x), float(y)

@@ -5,6 +5,10 @@ returns are released at e; its worker, and its mutually exclusive callback group
 t + c, where c is its cost, if it has the device to itself; where callbacks share a device, the context's
 :class:`~robotbrain.ros.resources.DeviceResources` say when. Ready callbacks start in the order in which they
 became ready.
+
+Known departure: genuine executors look at entities in turn, the kit at messages. A message that pushes another out of a
+full queue waits behind all that came before it, so under overload a subscription of depth 1 may be passed over more
+often here than there.
 """
 
 from __future__ import annotations

@@ -78,7 +78,9 @@ def _same_angle(got: Any, right: float) -> bool:
 
 
 def _yaw_hint(got: Any, right: float, plain: float) -> str:
-    if _same_angle(got, math.degrees(right)) or _same_angle(got, (plain + 180) % 360 - 180):
+    if _same_angle(got, plain):
+        return "wrap-the-difference"
+    if _same_angle(got, math.degrees(right)) or _same_angle(got, math.degrees(plain)):
         return "radians"
     if _same_angle(got, -right) or _same_angle(got, abs(right)) or _same_angle(got, -plain):
         return "estimate-minus-truth"
@@ -108,8 +110,9 @@ def _yaw_arrays(student: Any) -> None:
     except (TypeError, ValueError) as error:
         fail(f"for arrays it says: {error}", hint="works-for-arrays")
     right = np.radians([-2.0, 5.0, 15.0])
-    good = np.shape(got) == (3,) and np.allclose(got, right, atol=1e-6)
-    expect(good, "for arrays it should return an array", expected=right, got=got, hint="works-for-arrays")
+    expect(np.shape(got) == (3,), "for arrays it should return an array", got=got, hint="works-for-arrays")
+    good = np.allclose(got, right, atol=1e-6)
+    expect(good, "for arrays the numbers are wrong", expected=right, got=got, hint="wrap-the-difference")
 
 
 # ---------------------------------------------------------------- 2
@@ -219,7 +222,7 @@ def _frames(student: Any) -> None:
 
 _CHOICES = (
     "wrong unit",
-    "stale stamp",
+    "integer overflow",
     "wrong frame",
     "fresh stamp on old data",
     "unknown taken for free",
