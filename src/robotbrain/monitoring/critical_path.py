@@ -25,11 +25,12 @@ import bisect
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal
 
 from robotbrain.errors import InputError
 from robotbrain.monitoring.critical_path_blame import Occupancy, Place, place_of
 from robotbrain.monitoring.critical_path_device import Piece, lay_out
+from robotbrain.monitoring.critical_path_origins import Origins
 
 if TYPE_CHECKING:
     from robotbrain.monitoring.trace import Trace
@@ -41,9 +42,6 @@ View = Literal["age", "reaction"]
 
 CAUSES = ("execution", "contention", "queueing", "transport", "sensor", "sampling", "holding", "superseded")
 """What a piece of latency can be due to."""
-
-FEWEST = 3
-"""A topic with fewer messages than this in a trace is taken for a setting, not for a sensor."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,15 +95,8 @@ class Path:
         return self.end_ns - self.origin_ns
 
 
-class _Origin(NamedTuple):
-    """The newest measurement behind a callback, and the earlier callback that knew it (0: its own message)."""
-
-    origin_ns: int
-    state: int
-
-
-class Chains:
-    """Everything that led to the messages of one sink.
+class Chains(Origins):
+    """Everything that led to the messages of one sink, as paths.
 
     Args:
         trace: of a run.
@@ -116,99 +107,6 @@ class Chains:
     Raises:
         InputError: for a sink without messages or sources that do not reach it.
     """
-
-    def __init__(self, trace: Trace, sink: str = "/cmd_vel", sources: Sequence[str] | None = None) -> None:
-        self.trace, self.sink = trace, sink
-        topics = [message for message in trace.messages if message.name == sink and message.kind == "topic"]
-        answers = [message for message in trace.messages if message.name == sink and message.kind == "response"]
-        self.sinks = topics or answers
-        if not self.sinks:
-            names = sorted({message.name for message in trace.messages if message.kind != "request"})
-            raise InputError(
-                "sink", given=sink, expected="a topic or service of the trace: " + ", ".join(names), fix="Name one."
-            )
-        self._known = {record.id: record for record in trace.callbacks}
-        # What the robot measures is where chains begin, asked for or not: else they would run on through its motion.
-        self._source_topics = self._find_sources() | set(sources or ())
-        self._origins: dict[int, dict[str, _Origin]] = {}
-        self._reached: dict[tuple[Place, str], set[int]] = {}
-        self._trace_origins()
-        reach = self._reaching()
-        if sources is not None and (missing := [topic for topic in sources if topic not in reach]):
-            raise InputError(
-                "sources",
-                given=missing,
-                expected=f"topics behind {sink}: {', '.join(sorted(reach)) or 'none found'}",
-                fix="Leave sources out to see all of them.",
-            )
-        if not reach:
-            raise InputError(
-                "sources",
-                given=f"a trace in which nothing measured leads to {sink}",
-                expected="a chain of messages from a sensor",
-                fix="Name the topics to start from: sources=['/scan'].",
-            )
-        self.sources = tuple(sorted(reach if sources is None else set(sources)))
-
-    # ------------------------------------------------------------ what is behind each callback
-
-    def _find_sources(self) -> set[str]:
-        trace = self.trace
-        takes = {record.node for message in self.sinks for record in trace.takers.get(message.id, ())}
-        fed = {record.node for record in trace.callbacks if record.message}
-        count: dict[str, int] = {}
-        for message in trace.messages:
-            sender = trace.sender.get(message.id)
-            outside = sender is None or sender.node in takes or sender.node not in fed
-            if outside and message.kind == "topic" and message.name != self.sink:
-                count[message.name] = count.get(message.name, 0) + 1
-        return {topic for topic, messages in count.items() if messages >= FEWEST}
-
-    def origin_ns(self, message: MessageRecord) -> int:
-        """Return when what a source's message describes was measured: its stamp, unless that lies in the future."""
-        stamp = self.trace.stamps.get(message.id, 0)
-        return stamp if 0 < stamp <= message.released_ns else message.released_ns
-
-    def _trace_origins(self) -> None:
-        inputs: dict[str, dict[Place, list[CallbackRecord]]] = {}
-        for record in self.trace.callbacks:
-            here: dict[str, _Origin] = {}
-            message = self.trace.message_by_id.get(record.message)
-            if message is not None:
-                for topic, origin in self.behind(message).items():
-                    here[topic] = _Origin(origin, 0)
-            triggered = set(here)
-            mine = place_of(record)
-            if record.published or record.kind == "timer":
-                for place, earlier in inputs.get(record.node, {}).items():
-                    if place == mine:
-                        continue
-                    last = next((other for other in reversed(earlier) if other.end_ns <= record.start_ns), None)
-                    for topic, found in self._origins[last.id].items() if last is not None else ():
-                        if topic in triggered:
-                            continue
-                        known = here.get(topic)
-                        if known is None or found.origin_ns >= known.origin_ns:
-                            here[topic] = _Origin(found.origin_ns, last.id if last is not None else 0)
-            self._origins[record.id] = here
-            for topic, found in here.items():
-                self._reached.setdefault((mine, topic), set()).add(found.origin_ns)
-            if record.message:
-                inputs.setdefault(record.node, {}).setdefault(mine, []).append(record)
-
-    def behind(self, message: MessageRecord) -> Mapping[str, int]:
-        """Return the time of the newest measurement of each source behind a message, ns."""
-        if message.kind == "topic" and message.name in self._source_topics:
-            return {message.name: self.origin_ns(message)}
-        sender = self.trace.sender.get(message.id)
-        if sender is None:
-            return {}
-        return {topic: found.origin_ns for topic, found in self._origins.get(sender.id, {}).items()}
-
-    def _reaching(self) -> set[str]:
-        return {topic for message in self.sinks for topic in self.behind(message)}
-
-    # ------------------------------------------------------------ paths
 
     @cached_property
     def pieces(self) -> Mapping[int, tuple[Piece, ...]]:
@@ -245,10 +143,10 @@ class Chains:
         end = message.released_ns
         record = self.trace.sender.get(message.id)
         while record is not None:
-            mine, state = place_of(record), self._origins[record.id][source].state
+            mine, state = place_of(record), self.origins[record.id][source].state
             spans.extend(self._running(record))
             if state:
-                before = self._known[state]
+                before = self.known[state]
                 spans.extend(self._waiting(record, max(before.end_ns, min(record.ready_ns, record.start_ns))))
                 spans.extend(self._sampling(record, before))
                 record = before
@@ -256,7 +154,7 @@ class Chains:
             spans.extend(self._waiting(record, record.ready_ns))
             taken = self.trace.message_by_id[record.message]
             spans.append(Span("transport", mine, taken.name, None, taken.released_ns, record.ready_ns, record.id))
-            if taken.kind == "topic" and taken.name in self._source_topics:
+            if taken.kind == "topic" and taken.name in self.source_topics:
                 measured = self.origin_ns(taken)
                 spans.append(Span("sensor", mine, taken.name, None, measured, taken.released_ns))
                 break
@@ -360,7 +258,7 @@ class Chains:
         """Return the first callback on a path that an older measurement did not get to."""
         places = list(dict.fromkeys(span.place for span in path.spans))
         for place in places:
-            if origin_ns not in self._reached.get((place, path.source), ()):
+            if origin_ns not in self.reached.get((place, path.source), ()):
                 return place
         return places[-1]
 

@@ -46,12 +46,14 @@ class Change:
 
 
 def check_positive(what: str, value: object, fix: str) -> None:
+    """Raise InputError unless ``value`` is a finite number above zero."""
     good = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value) and value > 0
     if not good:
         raise InputError(what, given=value, expected="a number > 0", fix=fix)
 
 
 def edit_stages(model: Model, chosen: Callable[[Stage], bool], edit: Callable[[Stage], Stage]) -> Model:
+    """Return a model with ``edit`` made to the chosen callbacks."""
     return dataclasses.replace(
         model, stages={place: edit(stage) if chosen(stage) else stage for place, stage in model.stages.items()}
     )
