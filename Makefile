@@ -22,8 +22,8 @@ install: $(STAMP)  ## Make .venv and install the kit into it
 demo: $(STAMP)  ## The main job: make the labs, grade the sample class, drive the robot, show one page
 	$(BIN)/robotbrain demo
 
-test: $(STAMP)  ## Run the tests
-	$(BIN)/python -m pytest
+test: $(STAMP)  ## Run the tests, two files at a time
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile
 
 lint: $(STAMP)  ## Check style and types
 	$(BIN)/ruff check .

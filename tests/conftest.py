@@ -22,6 +22,21 @@ def need(condition: object, reason: str) -> None:
     pytest.skip(reason)
 
 
+SLOW_FILES = ("test_lab_integration.py", "test_hw3_performance.py")
+"""Files that take minutes: with two workers (pytest-xdist) they must not be left for the end."""
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Run the slow files first; the order within a file stays."""
+    items.sort(key=lambda item: item.path.name not in SLOW_FILES)
+
+
+def graders() -> int:
+    """Return how many submissions a test may grade at a time: two, unless the tests themselves run side by side."""
+    return 1 if os.environ.get("PYTEST_XDIST_WORKER") else 2
+
+
 @pytest.fixture(scope="session")
 def repo() -> Path:
     """Return the root of the checkout."""

@@ -11,6 +11,7 @@ from robotbrain.grading import Suite, load_hidden_suite, mutation
 from robotbrain.grading.classroom import ClassResult, grade_class
 from robotbrain.grading.course import find_course, release_differences
 from robotbrain.grading.sample import load_mutants, make_class
+from tests.conftest import graders
 
 LAB = "lab_integration"
 
@@ -52,7 +53,7 @@ def graded(repo: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[ClassR
     out = tmp_path_factory.mktemp("class")
     course = find_course(repo)
     manifest = make_class(course, LAB, out / "class")
-    return grade_class(course, LAB, submitted=out / "class", out=out / "graded", workers=2), manifest
+    return grade_class(course, LAB, submitted=out / "class", out=out / "graded", workers=graders()), manifest
 
 
 @pytest.mark.timeout(1200)
