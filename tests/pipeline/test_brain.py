@@ -211,3 +211,35 @@ def test_thinning_keeps_every_occupied_square_once() -> None:
     squares = {(int(a), int(b)) for a, b in np.floor(points / 0.1)}
     assert len(thin) == len(squares)
     assert np.abs(points[:, None] - thin[None]).max(axis=2).min(axis=1).max() <= 0.05 + 1e-9
+
+
+def test_ages_are_right_when_messages_come_late() -> None:
+    from robotbrain.monitoring import end_to_end_ms
+    from robotbrain.monitoring.faults import LateFrames
+
+    for late_ms in (0.0, 150.0):
+        fault = LateFrames("/perception/points", late_ms)
+        run = drive(3, difficulty=0.2, time_limit=4, trace=True, attach=[fault.install])
+        assert run.trace is not None
+        assert np.median(run.e2e_ms) == pytest.approx(np.nanmedian(end_to_end_ms(run.trace)), abs=1e-6)
+        assert np.median(run.camera_age_ms) > late_ms
+
+
+@pytest.mark.parametrize(("encoding", "flipped"), [("rgb8", False), ("bgr8", True)])
+def test_colours_are_read_in_the_order_that_the_message_says(encoding: str, flipped: bool) -> None:
+    from robotbrain.pipeline.nodes.perception import rgb_of
+    from robotbrain.ros.conversions import ns_to_time, numpy_to_image
+
+    image = np.arange(2 * 3 * 3, dtype=np.uint8).reshape(2, 3, 3)
+    msg = numpy_to_image(image, encoding, stamp=ns_to_time(0), frame_id="camera")
+    assert np.array_equal(rgb_of(msg), image[..., ::-1] if flipped else image)
+
+
+def test_an_image_without_colours_is_refused() -> None:
+    from robotbrain.errors import InputError
+    from robotbrain.pipeline.nodes.perception import rgb_of
+    from robotbrain.ros.conversions import ns_to_time, numpy_to_image
+
+    msg = numpy_to_image(np.zeros((2, 3), np.uint8), "mono8", stamp=ns_to_time(0), frame_id="camera")
+    with pytest.raises(InputError, match="mono8"):
+        rgb_of(msg)

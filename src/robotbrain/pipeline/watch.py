@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import struct
 from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from robotbrain.monitoring.trace import stamp_of
+
 if TYPE_CHECKING:
     from robotbrain.pipeline.costs import ProfileCosts
-    from robotbrain.ros.context import CallbackRecord
+    from robotbrain.ros.context import CallbackRecord, MessageRecord
     from robotbrain.sim import RobotSim
 
 STAMPED = ("/scan", "/perception/points", "/odometry/filtered")
@@ -24,12 +25,6 @@ PERIODS_MS = {
     ("estimator", "subscription", "/joint_states"): ("estimator_wheels", 20.0),
 }
 """Callbacks with a deadline: (role, kind, name) -> (short name, period of the timer or sensor, ms)."""
-
-
-def stamp_of(cdr: bytes) -> int:
-    """Return the header stamp of a message in ns: CDR starts with four bytes of encapsulation, then the stamp."""
-    seconds, nanoseconds = struct.unpack_from("<iI", cdr, 4)
-    return int(seconds) * 1_000_000_000 + int(nanoseconds)
 
 
 class Watch:
@@ -58,12 +53,12 @@ class Watch:
         self.reached = False
         self._commands = 0
         self._first_command_ns = self._last_command_ns = 0
-        # What a message of (topic, release time) stands for: its own stamp, for odometry that of the scan behind it.
-        self._origin_ns: dict[tuple[str, int], int | None] = {}
+        # What a message stands for, by its id: its own stamp, for odometry that of the scan behind it.
+        self._origin_ns: dict[int, int | None] = {}
         self._estimator_scan_ns: int | None = None
         self._controller_scan_ns: int | None = None
         self._controller_image_ns: int | None = None
-        context.add_tap(self._on_message)
+        context.add_message_tap(self._on_message)
         context.add_callback_tap(self._on_callback)
 
     @property
@@ -86,17 +81,20 @@ class Watch:
         self.trajectory.append((now, pose.x, pose.y, pose.yaw))
         self.boxes.append([(p.x, p.y, p.yaw) for p in sim.truth.obstacle_poses()])
 
-    def _on_message(self, time_ns: int, topic: str, type_name: str, _node: str, cdr: bytes) -> None:
+    def _on_message(self, record: MessageRecord, cdr: bytes) -> None:
+        time_ns, topic = record.released_ns, record.name
+        if record.kind != "topic":
+            return
         if topic == "/cmd_vel":
             self._on_command(time_ns)
         elif topic == "/odometry/filtered":
-            self._origin_ns[topic, time_ns] = self._estimator_scan_ns
+            self._origin_ns[record.id] = self._estimator_scan_ns
         elif topic in STAMPED:
-            self._origin_ns[topic, time_ns] = stamp_of(cdr)
+            self._origin_ns[record.id] = stamp_of(cdr)
         elif topic == "/perception/segmentation":
             self.perception_ms.append((time_ns - stamp_of(cdr)) * 1e-6)
         elif topic in ("/plan", "/goal_pose", "/goal_reached"):
-            self._on_decision(time_ns, topic, type_name, cdr)
+            self._on_decision(time_ns, topic, record.type_name, cdr)
 
     def _on_command(self, time_ns: int) -> None:
         if not self._commands:
@@ -127,9 +125,9 @@ class Watch:
             return
         if record.kind == "subscription":
             if role == "estimator" and record.name == "/scan":
-                self._estimator_scan_ns = self._origin_ns.get(("/scan", record.ready_ns))
+                self._estimator_scan_ns = self._origin_ns.get(record.message)
             elif role == "controller" and record.name in STAMPED:
-                origin = self._origin_ns.get((record.name, record.ready_ns))
+                origin = self._origin_ns.get(record.message)
                 if origin is None:
                     pass
                 elif record.name == "/odometry/filtered":

@@ -9,6 +9,7 @@ from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
+from robotbrain.errors import InputError
 from robotbrain.jetson.engine import OnnxEngine
 from robotbrain.pipeline.segmentation import (
     CameraModel,
@@ -24,6 +25,25 @@ from robotbrain.ros.conversions import image_to_numpy, numpy_to_image, points_to
 BEST_EFFORT = ReliabilityPolicy.BEST_EFFORT
 FLOOR_LABEL, OBSTACLE_LABEL = 0.0, 1.0
 """Third coordinate of a published point: 0 on the floor, 1 on an obstacle (the points themselves are flat)."""
+
+
+def rgb_of(msg: Image) -> NDArray[np.uint8]:
+    """Return an image as (H, W, 3) red, green, blue.
+
+    Raises:
+        InputError: for an encoding that is not in colour: the network would see nonsense, and nobody would notice.
+    """
+    image = image_to_numpy(msg)
+    if msg.encoding == "bgr8":
+        return np.ascontiguousarray(image[..., ::-1])
+    if msg.encoding != "rgb8":
+        raise InputError(
+            "camera/image",
+            given=f"encoding {msg.encoding!r}",
+            expected="'rgb8' or 'bgr8'",
+            fix="Let the camera driver publish colour, or convert before.",
+        )
+    return image
 
 
 class PerceptionNode(Node):
@@ -66,7 +86,7 @@ class PerceptionNode(Node):
     def _on_image(self, msg: Image) -> None:
         if self._camera is None or self._depth is None or self._depth.header.stamp != msg.header.stamp:
             return
-        mask = self.segment(image_to_numpy(msg))
+        mask = self.segment(rgb_of(msg))
         points = back_project(image_to_numpy(self._depth), self._camera)
         charge_work("back_project", mask.size)
         self._publish(msg, mask, points)
