@@ -176,3 +176,9 @@ def test_options_have_defaults_that_suit_the_robot_command() -> None:
     from robotbrain.link.robot import RobotOptions
 
     assert (RemoteOptions().host, RemoteOptions().port) == (RobotOptions().host, RobotOptions().port)
+
+
+def test_a_part_whose_file_fails_is_named_with_the_line(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text("import math\n\nradius = math.pi * x\n")
+    with pytest.raises(InputError, match=r"line 3: NameError: name 'x' is not defined"):
+        load_part(f"planner={tmp_path / 'mine.py'}:MyPlanner")

@@ -47,8 +47,13 @@ def robot_arguments(parser: argparse.ArgumentParser) -> None:
 
 def robot_main(arguments: argparse.Namespace) -> int:
     """Run the robot until Ctrl-C."""
+    from robotbrain.errors import InputError
     from robotbrain.link.robot import RobotOptions, run_robot
 
+    if arguments.token == "":
+        raise InputError("--token", given="nothing", expected="a word", fix="Leave the option out for a random one.")
+    if arguments.lockstep is not None and not arguments.lockstep > 0:
+        raise InputError("--lockstep", given=arguments.lockstep, expected="a latency > 0, ms", fix="Try --lockstep 1.")
     end_on_terminate()
     options = RobotOptions(
         world=arguments.world,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import json
+import traceback
 import types
 from collections.abc import Callable
 from pathlib import Path
@@ -41,7 +42,14 @@ def load_part(spec: str) -> tuple[str, Callable[[], Any]]:
         ) from None
     module = types.ModuleType(path.stem)
     module.__file__ = str(path)
-    exec(compile(tree, str(path), "exec"), module.__dict__)
+    try:
+        exec(compile(tree, str(path), "exec"), module.__dict__)
+    except Exception as error:  # whatever a student's file raises while it is loaded
+        frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
+        line = f", line {frames[-1].lineno}" if frames else ""
+        raise InputError(
+            "part", given=spec, expected="a file that loads", fix=f"{path}{line}: {type(error).__name__}: {error}"
+        ) from error
     found = getattr(module, name, None)
     if not callable(found):
         raise InputError("part", given=spec, expected=f"a class {name!r} in {path}", fix="Check the spelling.")

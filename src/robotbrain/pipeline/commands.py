@@ -118,8 +118,47 @@ def _drive_ros(arguments: argparse.Namespace) -> int:
     return 0 if run.reached else 1
 
 
+SIMULATED_ONLY = ("seeds", "difficulty", "profile", "mode", "deployment", "html")
+OUTSIDE_ONLY = (
+    "transport",
+    "address",
+    "token",
+    "domain",
+    "description",
+    "use_sim_time",
+    "no_preflight",
+    "time_limit",
+    "bag",
+    "decisions",
+    "part",
+)
+"""Options of ``robotbrain drive`` that one kind of robot knows, and the other does not."""
+
+
+def _refuse_foreign(arguments: argparse.Namespace) -> None:
+    """Raise InputError for an option that would be ignored."""
+    from robotbrain.errors import InputError
+
+    parser = argparse.ArgumentParser()
+    drive_arguments(parser)
+    outside = arguments.robot == "ros"
+    for name in SIMULATED_ONLY if outside else OUTSIDE_ONLY:
+        if getattr(arguments, name) != parser.get_default(name):
+            raise InputError(
+                "--" + name.replace("_", "-"),
+                given=str(getattr(arguments, name)),
+                expected="no such option " + ("with --robot ros" if outside else "without --robot ros"),
+                fix="`robotbrain robot` takes the world of a simulated robot."
+                if outside
+                else "Add --robot ros, or leave it out.",
+            )
+    if outside and not arguments.time_limit > 0:
+        raise InputError("--time-limit", given=arguments.time_limit, expected="seconds > 0", fix="120 is the default.")
+
+
 def drive_main(arguments: argparse.Namespace) -> int:
     """Drive, one line a run, and a summary."""
+    _refuse_foreign(arguments)
     if arguments.robot == "ros":
         return _drive_ros(arguments)
     from robotbrain.errors import InputError

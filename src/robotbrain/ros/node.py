@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
+from robotbrain.errors import InputError
 from robotbrain.ros.arguments import parse_arguments
 from robotbrain.ros.callback_groups import CallbackGroup, MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from robotbrain.ros.clock import Clock, ROSClock
@@ -232,6 +233,10 @@ class Node(NodeGraph, NodeParameters):
     ) -> Subscription:
         """Create a subscription; ``raw`` gives the callback CDR bytes instead of a message."""
         self._check_alive()
+        if callback is None:
+            raise InputError(
+                f"callback of a subscription to {topic}", given=None, expected="a function", fix="Pass it without ()."
+            )
         name, qos = self.resolve_topic_name(topic), as_profile(qos_profile)
         qos = self._qos("subscription", name, qos, qos_overriding_options)
         if name in SYSTEM_TOPICS:

@@ -249,13 +249,15 @@ class Client(Entity):
         """Call and wait, outside callbacks only.
 
         Raises:
-            ReentrancyError: inside a callback, where genuine rclpy deadlocks.
+            ReentrancyError: inside a callback. Genuine rclpy deadlocks there too, unless a MultiThreadedExecutor and
+                another callback group leave a thread for the answer; the kit never has one.
             TimeoutError: no answer in time.
         """
         if self.node.context.in_callback():
             raise ReentrancyError(
                 f"client.call({self.srv_name}) inside a callback waits for an answer that can only come after the "
-                "callback returns (genuine rclpy deadlocks): use future = client.call_async(request) and "
+                "callback returns (genuine rclpy deadlocks too, unless another thread and callback group are free; "
+                "the kit runs callbacks one by one): use future = client.call_async(request) and "
                 "future.add_done_callback(...), or 'await' it in an async def callback"
             )
         future = self.call_async(request)

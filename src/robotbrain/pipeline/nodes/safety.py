@@ -219,7 +219,10 @@ class SafetyNode(Node):
         ramp = self.limits.ramp_s(self._limiter.v, self._limiter.w)
         if self._wanted is not None and not -1.0 <= age < self.limits.timeout_s - ramp:
             if any(self._wanted):
-                self.get_logger().warning(f"watchdog: no command for {age:.2f} s, stopping", throttle_duration_sec=1.0)
+                self.get_logger().warning(
+                    f"watchdog: no command for {age:.2f} s; braking now, to stand at {self.limits.timeout_s:g} s",
+                    throttle_duration_sec=1.0,
+                )
             self._wanted = None
         if self._wanted is not None:
             v, w = self._limiter.follow(*self._wanted, dt)

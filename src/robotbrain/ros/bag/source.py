@@ -132,8 +132,8 @@ class RosbagsSource:
     def __init__(self, path: Path) -> None:
         from rosbags.rosbag2 import Reader
 
-        self._reader: Any = Reader(path)
         try:
+            self._reader: Any = Reader(path)
             self._reader.open()
         except Exception as error:  # rosbags, its YAML parser, sqlite3 or the decompressor: whatever they raise
             raise InputError(
