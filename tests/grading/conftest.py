@@ -22,6 +22,12 @@ def _toy_suite(course_root: Path) -> Iterator[None]:
         yield
 
 
+@pytest.fixture(autouse=True)
+def _toy_hidden_tests(course_root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tests of other folders may have graded in this process meanwhile, and so have named another folder."""
+    monkeypatch.setenv(AUTOGRADER_VARIABLE, str(course_root / "autograder"))
+
+
 @pytest.fixture
 def notebook_globals() -> dict[str, object]:
     return {"__name__": "__main__"}

@@ -154,7 +154,9 @@ def test_spans_add_up_to_the_latency_exactly(seed: int, fault: str) -> None:
         # The first command that reflects a measurement or a newer one, looked for the slow way.
         behind = [(chains.behind(m).get(source, -1), m.released_ns) for m in chains.sinks]
         for path in reactions:
-            assert path.end_ns == min(released for origin, released in behind if origin >= path.origin_ns)
+            answers = [released for origin, released in behind if origin >= path.origin_ns]
+            assert path.end_ns == min(answers, default=trace.end_ns) and (path.message > 0) == bool(answers)
+    assert [path.latency_ns for path in chains.ages()] == chains.oldest_ns()
     budget = latency_budget(chains.reactions(chains.slowest_source))
     assert sum(row.mean_ms for row in budget.rows) == pytest.approx(budget.mean_ms)
     assert sum(row.share for row in budget.rows) == pytest.approx(1)
@@ -182,6 +184,28 @@ def test_the_age_of_images_is_that_of_the_run_s_own_report(one_thread: bool) -> 
     assert run.trace is not None
     ages = [p.latency_ns * 1e-6 for p in Chains(run.trace).ages("/camera/image")][-len(run.camera_age_ms) :]
     np.testing.assert_allclose(ages, run.camera_age_ms, atol=1e-9)
+    oldest = np.array(Chains(run.trace).oldest_ns()) * 1e-6
+    np.testing.assert_allclose(oldest[-len(run.e2e_ms) :], run.e2e_ms[-len(oldest) :], atol=1e-9)
+
+
+def test_measurements_that_hang_are_counted_and_those_at_the_end_are_not() -> None:
+    rig = Rig()
+    rig.sensor("/camera", 100)
+    rig.stage("see", "/camera", ("cpu", 300), out="/cmd_vel", depth=None)
+    rig.sink()
+    trace = rig.run(6.0)
+    chains = Chains(trace)
+    reactions = chains.reactions("/camera")
+    check_exact(reactions)
+    # Frame k (1 to 60) is answered at 300 k + 100 ms, so 19 are; their median is 200 * 10 + 100 ms. Of the others those
+    # that have waited for longer count: 6000 - 100 k > 2100.
+    answered = [path for path in reactions if path.message]
+    hanging = [path for path in reactions if not path.message]
+    assert [path.latency_ns // MS for path in answered] == [200 * k + 100 for k in range(1, 20)]
+    assert [path.latency_ns // MS for path in hanging] == [6000 - 100 * k for k in range(20, 39)]
+    assert chains.unanswered("/camera") == 41
+    assert load(trace).stages[0].waiting == pytest.approx(20, abs=1)
+    assert {span.place for path in hanging for span in path.spans} == {Place("/see", "subscription", "/camera")}
 
 
 def test_service_answers_are_sinks_too() -> None:

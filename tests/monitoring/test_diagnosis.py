@@ -12,7 +12,7 @@ from robotbrain.monitoring.diagnosis import ABSORBED, Diagnosis, diagnose
 from robotbrain.monitoring.diagnosis_candidates import best_phase_ms
 from robotbrain.monitoring.diagnosis_options import brain_options
 from robotbrain.monitoring.generate import generate_pipeline
-from robotbrain.monitoring.whatif import Faster, OwnExecutor, QueueDepth, TimerPhase, Without, outcome
+from robotbrain.monitoring.whatif import Faster, OwnExecutor, QueueDepth, TimerPhase, Without, outcome, predict
 from tests.monitoring.small_pipelines import MS, Rig
 
 
@@ -83,6 +83,39 @@ def test_latency_and_throughput_have_different_bottlenecks() -> None:
     slow = healthy(gpu=180).run(10.0)
     limited = diagnose(slow).throughput
     assert limited.limited and "/see" in limited.limit and limited.use == pytest.approx(1.9, rel=0.05)
+
+
+def test_a_backlog_is_named_though_others_wait_behind_it() -> None:
+    from robotbrain.ros.executors import Executor
+
+    rig = Rig()
+    shared = Executor(context=rig.context, num_threads=1)
+    rig.sensor("/camera", 50)
+    rig.sensor("/lidar", 100)
+    rig.stage("see", "/camera", ("cpu", 55), out="/seen", depth=None, executor=shared)
+    rig.stage("act", "/lidar", ("cpu", 2), out="/cmd_vel", depth=2, executor=shared)
+    rig.sink()
+    found = diagnose(rig.run(10.0))
+    assert (found.bottleneck.kind, found.bottleneck.culprit) == ("stale queue", "/see")
+    assert QueueDepth("/see", "/camera", 1) in [proposal.change for proposal in found.proposals]
+
+
+def test_a_change_that_leaves_another_sensor_waiting_says_so() -> None:
+    rig = Rig()
+    rig.sensor("/lidar", 100)
+    rig.sensor("/camera", 100)
+    rig.stage("match", "/lidar", ("cpu", 60), out="/matched")
+    rig.stage("see", "/camera", ("cpu", 40), out="/seen")
+    rig.stage("act", "/seen", out="/cmd_vel")
+    rig.stage("act", "/matched", out="/cmd_vel")
+    rig.sink()
+    trace = rig.run(4.0)
+    (quick,) = predict(trace, Faster("/match", 10))
+    assert quick.before.source == "/lidar" and quick.before.p50_ms == pytest.approx(60)
+    assert quick.after.p50_ms == pytest.approx(6) and quick.gain == pytest.approx(0.9)
+    assert quick.slowest[0] == "/camera" and quick.slowest[1] == pytest.approx(40)
+    assert quick.overall_gain == pytest.approx(1 / 3)
+    assert "but then /camera takes longest: median 40.0 ms" in str(diagnose(trace, options=[Faster("/match", 10)]))
 
 
 def test_a_timer_out_of_step_is_put_in_step() -> None:

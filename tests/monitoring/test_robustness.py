@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from scipy.stats import binomtest
 
 from robotbrain.errors import InputError
-from robotbrain.monitoring.faults import Blackout, Fault, Noise
+from robotbrain.monitoring.faults import Blackout, Fault, LateFrames, Noise
 from robotbrain.monitoring.robustness import robustness, standard_faults
 from robotbrain.monitoring.robustness_results import NOTHING, mcnemar, wilson
 from robotbrain.ros import SimContext
@@ -45,6 +45,7 @@ class Runner:
             success=not failed,
             reason="did not arrive" if failed else "reached the goal",
             seconds=20.0 + seed,
+            trace=None,
             e2e_ms=np.full(10, 50.0 + 10 * loud) if not dark else np.zeros(0),
         )
 
@@ -119,6 +120,15 @@ def test_a_node_that_does_not_survive_is_a_result() -> None:
 
     result = robustness([1], {}, runner=runner, progress=False)
     assert result.summaries[0].reasons == (("ZeroDivisionError: no points left", 1),)
+
+
+def test_late_frames_show_in_the_latency() -> None:
+    # Watch pairs messages by the time at which they were published, so late ones would be missing from a run's report.
+    late = {"late": {"100 ms": [LateFrames("/scan", 100.0)]}}
+    plain, delayed = robustness([6000], late, progress=False, time_limit=2).summaries
+    # The controller looks every 50 ms, so 100 ms of delay cost 50 to 100.
+    assert 45 <= delayed.e2e_p50_ms - plain.e2e_p50_ms <= 105
+    assert 45 <= delayed.e2e_p99_ms - plain.e2e_p99_ms <= 105
 
 
 def test_the_standard_faults_are_many_and_distinct() -> None:

@@ -185,6 +185,25 @@ def test_times_on_no_grid_are_none() -> None:
     assert timer_grid([5]) == (0, 0)
 
 
+def test_what_was_lost_or_late_on_its_way_is_so_in_the_replay() -> None:
+    from robotbrain.monitoring.faults import DropFrames, LateFrames
+
+    rig = Rig(latency_ns=MS)
+    DropFrames("/camera", 0.3, 2.0).install(rig.context)
+    LateFrames("/seen", 20.0, 0.5, jitter_ms=8.0).install(rig.context)
+    rig.sensor("/camera", 50)
+    rig.stage("see", "/camera", ("cpu", 10), out="/seen")
+    rig.stage("act", "/seen", ("cpu", 5), out="/cmd_vel")
+    rig.sink()
+    trace = rig.run(5.0)
+    again = replay_trace(trace)
+    assert schedule(again) == schedule(trace)
+    assert 40 < len({r.message for r in trace.callbacks if r.name == "/camera"}) < 85
+    # Twice as fast, the same frames are lost.
+    (prediction,) = predict(trace, Faster("/see", 2))
+    assert prediction.after.fresh_hz == pytest.approx(prediction.before.fresh_hz, rel=0.02)
+
+
 def test_timers_of_one_name_are_kept_apart() -> None:
     rig = Rig(cores=1)
     rig.sensor("/camera", 100)
