@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from robotbrain.monitoring.chains import chain_ages, end_to_end_ms, find_chains
     from robotbrain.monitoring.dashboard import Dashboard
     from robotbrain.monitoring.deadlines import KIT_DEADLINES, Deadlines
+    from robotbrain.monitoring.diagnosis import Diagnosis, diagnose
     from robotbrain.monitoring.metrics import measure
     from robotbrain.monitoring.monitor import Monitor
     from robotbrain.monitoring.perfetto import write_perfetto
@@ -28,6 +29,7 @@ __all__ = [
     "AlarmRules",
     "Dashboard",
     "Deadlines",
+    "Diagnosis",
     "LatencySketch",
     "Monitor",
     "OnlineSegmentationAccuracy",
@@ -35,6 +37,7 @@ __all__ = [
     "Summary",
     "Trace",
     "chain_ages",
+    "diagnose",
     "end_to_end_ms",
     "find_chains",
     "measure",
@@ -48,6 +51,7 @@ _HOMES = {
     "chains": ("chain_ages", "end_to_end_ms", "find_chains"),
     "dashboard": ("Dashboard",),
     "deadlines": ("KIT_DEADLINES", "Deadlines"),
+    "diagnosis": ("Diagnosis", "diagnose"),
     "metrics": ("measure",),
     "monitor": ("Monitor",),
     "perfetto": ("write_perfetto",),

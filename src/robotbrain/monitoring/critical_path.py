@@ -222,27 +222,62 @@ class Chains(Origins):
                 found.append(path)
         return tuple(found)
 
-    def reactions(self, source: str) -> tuple[Path, ...]:
-        """Return the path of each measurement of ``source`` to the first message of the sink that reflects it.
+    def oldest_ns(self) -> list[int]:
+        """Return the latencies of :meth:`ages` without building the paths, ns."""
+        found = []
+        for message in self.sinks:
+            behind = self.behind(message)
+            if all(topic in behind for topic in self.sources):
+                found.append(message.released_ns - min(behind[topic] for topic in self.sources))
+        return found
 
-        Measurements that nothing reflected before the trace ended are left out.
-        """
+    def _answers(self, source: str) -> list[tuple[int, MessageRecord | None]]:
+        """Return (time, first message of the sink that reflects it) of each measurement; None: there was none."""
         steps: list[tuple[int, MessageRecord]] = []
         for message in self.sinks:
             origin = self.behind(message).get(source)
             if origin is not None and (not steps or origin > steps[-1][0]):
                 steps.append((origin, message))
         origins = [origin for origin, _ in steps]
+        found: list[tuple[int, MessageRecord | None]] = []
+        for message in self.trace.messages:
+            if message.name == source and message.kind == "topic":
+                origin = self.origin_ns(message)
+                place = bisect.bisect_left(origins, origin)
+                found.append((origin, steps[place][1] if place < len(steps) else None))
+        return found
+
+    def _counted(self, source: str) -> list[tuple[int, MessageRecord | None]]:
+        """Return those answers that count: without the measurements that had no time to be answered."""
+        found = self._answers(source)
+        middle = _median([sink.released_ns - origin for origin, sink in found if sink is not None])
+        end = self.trace.end_ns
+        return [(o, sink) for o, sink in found if sink is not None or (middle >= 0 and end - o > middle)]
+
+    def unanswered(self, source: str) -> int:
+        """Return how many measurements of ``source`` nothing reflected before the trace ended."""
+        return sum(sink is None for _, sink in self._answers(source))
+
+    def delays(self, source: str) -> list[int]:
+        """Return the latencies of :meth:`reactions` without building the paths, ns."""
+        end = self.trace.end_ns
+        return [(end if sink is None else sink.released_ns) - origin for origin, sink in self._counted(source)]
+
+    def reactions(self, source: str) -> tuple[Path, ...]:
+        """Return the path of each measurement of ``source`` to the first message of the sink that reflects it.
+
+        A measurement that nothing reflected before the trace ended counts with the time that it had waited (its
+        ``message`` is 0), if that is longer than the median of the others: leaving it out would make a brain that
+        hangs look quick. Those at the very end, which had no time, are left out.
+        """
         paths: dict[int, Path] = {}
         found = []
-        for message in self.trace.messages:
-            if message.name != source or message.kind != "topic":
+        for origin, sink in self._counted(source):
+            if sink is None:
+                last = paths[max(paths)]
+                lost = Span("superseded", self._lost(last, origin), source, None, origin, self.trace.end_ns)
+                found.append(Path(source, 0, origin, self.trace.end_ns, (lost,)))
                 continue
-            origin = self.origin_ns(message)
-            place = bisect.bisect_left(origins, origin)
-            if place == len(steps):
-                continue
-            sink = steps[place][1]
             path = paths.get(sink.id)
             if path is None:
                 built = self.path(sink, source)
@@ -279,21 +314,6 @@ class Chains(Origins):
         """Return the median, over the reactions of a source, of what is not spent lying in a node, ns."""
         idle = ("sampling", "holding", "superseded")
         return _median([sum(s.length_ns for s in p.spans if s.cause not in idle) for p in self.reactions(source)])
-
-    def delays(self, source: str) -> list[int]:
-        """Return the reactions of a source without building their paths, ns."""
-        steps: list[tuple[int, int]] = []
-        for message in self.sinks:
-            origin = self.behind(message).get(source)
-            if origin is not None and (not steps or origin > steps[-1][0]):
-                steps.append((origin, message.released_ns))
-        delays = []
-        for message in self.trace.messages:
-            if message.name == source and message.kind == "topic":
-                place = bisect.bisect_left(steps, (self.origin_ns(message), 0))
-                if place < len(steps):
-                    delays.append(steps[place][1] - self.origin_ns(message))
-        return delays
 
 
 def _median(values: Sequence[int]) -> int:

@@ -13,6 +13,7 @@ from robotbrain.monitoring.critical_path_blame import Place, place_of
 
 if TYPE_CHECKING:
     from robotbrain.monitoring.trace import Trace
+    from robotbrain.ros.context import MessageRecord
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +29,8 @@ class StageLoad:
         demand_ms: mean time on an idle device, ms.
         offered_hz: messages that came for it, or calls that its timer owed, per second.
         served_hz: runs per second.
+        waiting: messages or calls that waited for it on average (Little's law: their rate times their mean wait); those
+            still waiting at the end are counted in.
         lost: messages that were dropped before it could take them.
         use: offered_hz times service_ms: the share of one thread that it needs to keep up; above 1 it cannot.
     """
@@ -40,6 +43,7 @@ class StageLoad:
     demand_ms: float
     offered_hz: float
     served_hz: float
+    waiting: float
     lost: int
     use: float
 
@@ -103,6 +107,7 @@ class Load:
                     "demand_ms": stage.demand_ms,
                     "offered_hz": stage.offered_hz,
                     "served_hz": stage.served_hz,
+                    "waiting": stage.waiting,
                     "lost": stage.lost,
                     "use": stage.use,
                 }
@@ -150,6 +155,14 @@ def _stages(trace: Trace, seconds: float) -> tuple[StageLoad, ...]:
     for index, record in enumerate(trace.callbacks):
         runs.setdefault(place_of(record), []).append(index)
     published = Counter(message.name for message in trace.messages if message.kind == "topic")
+    arrivals: dict[str, list[MessageRecord]] = {}
+    for message in trace.messages:
+        if message.kind == "topic":
+            arrivals.setdefault(message.name, []).append(message)
+    taken: dict[Place, set[int]] = {}
+    for record in trace.callbacks:
+        if record.kind == "subscription":
+            taken.setdefault(place_of(record), set()).add(record.message)
     stages = []
     for place, indices in runs.items():
         records = [trace.callbacks[index] for index in indices]
@@ -157,6 +170,10 @@ def _stages(trace: Trace, seconds: float) -> tuple[StageLoad, ...]:
         service = float(np.mean([record.end_ns - record.start_ns for record in records])) * 1e-6
         lost = trace.dropped.get((place.node, place.name), 0) if place.kind == "subscription" else 0
         offered = max(len(records), published[place.name]) if place.kind == "subscription" else len(records)
+        # What still waits at the end has no record; unless queues are full it is what was neither taken nor lost.
+        left = [m for m in arrivals.get(place.name, ()) if m.id not in taken[place]] if place in taken else []
+        waits = sorted((trace.end_ns - m.released_ns) * 1e-9 for m in left)
+        hanging = sum(waits[: max(0, len(waits) - lost)])
         stages.append(
             StageLoad(
                 place,
@@ -167,6 +184,7 @@ def _stages(trace: Trace, seconds: float) -> tuple[StageLoad, ...]:
                 float(np.mean([record.demand_ns for record in records])) * 1e-6,
                 offered / seconds,
                 len(records) / seconds,
+                sum(record.queued_ns for record in records) * 1e-9 / seconds + hanging / seconds,
                 lost,
                 offered / seconds * service * 1e-3,
             )

@@ -179,7 +179,7 @@ def diagnose(
         except InputError:
             continue
     helping = [p for p in predictions if p.gain >= WORTH or p.throughput_gain >= 1 + WORTH]
-    helping.sort(key=lambda p: (-round(p.gain, 1), EFFORTS.index(p.change.takes), -p.gain, str(p.change)))
+    helping.sort(key=lambda p: (-round(p.overall_gain, 1), EFFORTS.index(p.change.takes), -p.gain, str(p.change)))
     useless = [p for p in predictions if p not in helping]
     bottleneck, causes = _verified(causes, predictions)
     return Diagnosis(
@@ -295,7 +295,10 @@ def _proposal(head: str, p: Prediction) -> list[str]:
         f"{p.before.p99_ms:.1f} -> {p.after.p99_ms:.1f} ms, fresh commands {p.before.fresh_hz:.1f} -> "
         f"{p.after.fresh_hz:.1f}/s"
     )
-    return [*textwrap.wrap(text, 110, initial_indent=head, subsequent_indent=" " * 5), " " * 5 + gain]
+    lines = [*textwrap.wrap(text, 110, initial_indent=head, subsequent_indent=" " * 5), " " * 5 + gain]
+    if p.slowest[1] > 1.1 * p.after.p50_ms:
+        lines.append(f"     but then {p.slowest[0]} takes longest: median {p.slowest[1]:.1f} ms")
+    return lines
 
 
 def _useless(p: Prediction) -> str:

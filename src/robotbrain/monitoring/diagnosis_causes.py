@@ -12,11 +12,17 @@ from robotbrain.monitoring.critical_path_blame import Place
 
 if TYPE_CHECKING:
     from robotbrain.monitoring.critical_path import Path, Span
-    from robotbrain.monitoring.critical_path_load import Load
+    from robotbrain.monitoring.critical_path_load import Load, StageLoad
     from robotbrain.monitoring.whatif_model import Model
 
 LARGE_BYTES = 1_000_000
 """Messages above this are called large: a VGA colour image has 0.92 MB."""
+
+PILED_UP = 5.0
+"""A queue in which more messages than this wait on average holds all of them up for long."""
+
+DEEP = 30
+"""Queues that hold fewer are not called deep: one that is full is a symptom of a busy thread, not the cause."""
 
 KINDS: Mapping[str, str] = {
     "slow node": "its callback takes long on the CPU",
@@ -119,6 +125,9 @@ def find_causes(paths: Sequence[Path], model: Model, load: Load) -> tuple[Findin
     for (kind, culprit, resource), found in sums.items():
         blamed = sorted(found.blamed.items(), key=lambda item: (-item[1], item[0]))
         place = max(found.places, key=lambda p: (found.places[p], p))
+        if kind == "stale queue":
+            # Others may wait behind it as well; what can be done is done to the queue itself.
+            place = Place(culprit, "subscription", resource)
         if "contention" in kind and blamed:
             culprit = blamed[0][0].node
         mean = found.total / count * 1e-6
@@ -126,6 +135,19 @@ def find_causes(paths: Sequence[Path], model: Model, load: Load) -> tuple[Findin
         draft = Finding(kind, culprit, place, resource, mean, found.total / total if total else 0.0, shown)
         findings.append(Finding(kind, culprit, place, resource, mean, draft.share, shown, naming.evidence(draft)))
     return tuple(sorted(findings, key=lambda f: (-f.mean_ms, f.kind, f.culprit)))
+
+
+def _backlogs(model: Model, load: Load) -> dict[int, Place]:
+    """Return, for each executor in which messages pile up in a deep queue, the subscription whose queue it is."""
+    depths = {place: stage.depth for place, stage in model.stages.items()}
+    found: dict[int, StageLoad] = {}
+    for stage in load.stages:
+        known = found.get(stage.executor)
+        depth = depths.get(stage.place)
+        deep = stage.place.kind == "subscription" and (depth is None or depth >= DEEP)
+        if deep and stage.waiting > (known.waiting if known else PILED_UP):
+            found[stage.executor] = stage
+    return {executor: stage.place for executor, stage in found.items()}
 
 
 class _Naming:
@@ -136,6 +158,7 @@ class _Naming:
         self._stage = {stage.place: stage for stage in load.stages}
         self._size: dict[str, float] = {name: size for name, (size, _) in model.transport.typical.items()}
         self._by_size: dict[tuple[Place, str], float] = {}
+        self._behind = _backlogs(model, load)
 
     def name(self, span: Span) -> list[tuple[_Key, Place, float]]:
         """Return the causes of a span: (kind, culprit, resource), place and share."""
@@ -177,6 +200,10 @@ class _Naming:
         return ("slow service" if place.kind == "service" else "slow node", place.node, resource)
 
     def _queueing(self, place: Place, by: Place | None, resource: str) -> _Key:
+        backlog = self._behind.get(int(resource.rpartition(" ")[2]))
+        if backlog is not None:
+            # All on this thread wait behind the messages that lie in one queue.
+            return ("stale queue", backlog.node, backlog.name)
         if by is not None and by.node != place.node:
             return ("serial executor", "", resource)
         if by == place and place.kind == "subscription":
@@ -196,6 +223,9 @@ class _Naming:
         if place.kind in ("service", "client"):
             return ("slow service", place.node, "cpu")
         stage = self._stage.get(place)
+        if stage is not None and stage.executor in self._behind:
+            backlog = self._behind[stage.executor]
+            return ("stale queue", backlog.node, backlog.name)
         if stage is not None and self._shares(stage.executor, place):
             return ("serial executor", "", f"executor {stage.executor}")
         return self._working(place, self._heaviest(place))

@@ -76,7 +76,8 @@ class Outcome:
 
     Attributes:
         source, sink: which.
-        mean_ms, p50_ms, p99_ms: from a measurement to the first command that reflects it or a newer one, ms.
+        mean_ms, p50_ms, p99_ms: from a measurement to the first command that reflects it or a newer one, ms; one that
+            hung to the end counts with the time it had waited.
         age_p50_ms, age_p99_ms: age of the newest measurement of the source behind each command, ms.
         fresh_hz: commands per second that reflect a measurement which none before did: the throughput.
         sink_hz: commands per second.
@@ -125,7 +126,6 @@ def _outcome(chains: Chains, source: str | None = None) -> Outcome:
             expected="a run in which some did",
             fix="Record for longer.",
         )
-    sent = sum(message.name == chosen and message.kind == "topic" for message in trace.messages)
     return Outcome(
         chosen,
         chains.sink,
@@ -137,7 +137,7 @@ def _outcome(chains: Chains, source: str | None = None) -> Outcome:
         len({origin for _, origin in known}) / trace.seconds,
         len(chains.sinks) / trace.seconds,
         sum(trace.dropped.values()),
-        sent - len(reactions),
+        chains.unanswered(chosen),
     )
 
 
@@ -155,6 +155,8 @@ class Prediction:
         after: predicted; what the replay says of the change, less what the replay without it gets wrong.
         estimate_ms: gain in the mean latency by the closed form, ms, for comparison.
         limit_ms: for faster work: the gain in the mean by the closed form if it took no time at all (Amdahl's limit).
+        slowest: the source that takes longest after the change, with its median in ms: a change may help one sensor and
+            leave another waiting. Only if sources were left to be found.
         replay_error: by how much the replay without the change misses the recorded median, relative.
     """
 
@@ -164,6 +166,7 @@ class Prediction:
     estimate_ms: float
     replay_error: float
     limit_ms: float | None = None
+    slowest: tuple[str, float] = ("", 0.0)
 
     @property
     def gain_ms(self) -> float:
@@ -184,6 +187,12 @@ class Prediction:
     def gain(self) -> float:
         """Gain in the median as a share of it, 0 to 1."""
         return self.gain_ms / self.before.p50_ms if self.before.p50_ms else 0.0
+
+    @property
+    def overall_gain(self) -> float:
+        """As :attr:`gain`, but with the source that is slowest after the change."""
+        left = max(self.after.p50_ms, self.slowest[1])
+        return 1 - left / self.before.p50_ms if self.before.p50_ms else 0.0
 
     @property
     def throughput_gain(self) -> float:
@@ -210,6 +219,8 @@ class Prediction:
             "throughput_gain": self.throughput_gain,
             "estimate_ms": self.estimate_ms,
             "limit_ms": self.limit_ms,
+            "slowest": list(self.slowest),
+            "overall_gain": self.overall_gain,
             "replay_error": self.replay_error,
         }
 
@@ -259,7 +270,8 @@ class WhatIf:
         Raises:
             InputError: if the pipeline does not have what is to be changed.
         """
-        after = self._measure(self.replay(change))
+        changed_trace = self.replay(change)
+        after = self._measure(changed_trace)
         b, r = self.before, self._baseline
 
         def corrected(name: str) -> float:
@@ -273,7 +285,18 @@ class WhatIf:
         limit = None
         if isinstance(change, Faster):
             limit = estimate_ms(self._paths, replace(change, times=1e12))
-        return Prediction(change, b, adjusted, estimate_ms(self._paths, change), error, limit)
+        slowest = self._slowest(changed_trace, adjusted)
+        return Prediction(change, b, adjusted, estimate_ms(self._paths, change), error, limit, slowest)
+
+    def _slowest(self, trace: Trace, after: Outcome) -> tuple[str, float]:
+        """Return the source that is slowest after a change, with its median, ms."""
+        if len(self.chains.sources) == 1:
+            return after.source, after.p50_ms
+        chains = Chains(trace, after.sink)
+        medians = {source: _percentile(np.array(chains.delays(source)) * 1e-6, 50) for source in chains.sources}
+        worst = max(medians, key=lambda source: (medians[source], source))
+        # Sources that are about as slow as the one in question are no news.
+        return (worst, medians[worst]) if medians[worst] > 1.1 * after.p50_ms else (after.source, after.p50_ms)
 
     def check(self, change: Change, made: Trace) -> tuple[Prediction, Outcome, float]:
         """Compare a prediction with a run in which the change was really made.

@@ -26,6 +26,10 @@ if TYPE_CHECKING:
     from robotbrain.ros.context import CallbackRecord, MessageRecord
 
 
+ROUNDING_NS = 1000
+"""Latencies that differ by less are taken as alike, ns."""
+
+
 def stage_of(trace: Trace, record: CallbackRecord) -> Place:
     """Return the stage that a record belongs to; the parts of a coroutine after the first are one of their own."""
     message = trace.message_by_id.get(record.message)
@@ -74,6 +78,7 @@ def infer_model(trace: Trace) -> Model:
         transport,
         _injected(trace, by_place, stages),
         _stamps(trace, roots),
+        _disturbed(trace, roots, transport),
     )
 
 
@@ -144,11 +149,42 @@ def _transport(trace: Trace) -> Transport:
     }
     rows = np.array([row for found in seen.values() for row in found], dtype=float).reshape(-1, 2)
     slope = 0.0
-    if len(rows) and rows[:, 0].std() > 0:
+    if len(rows) and rows[:, 0].std() > 0 and rows[:, 1].std() > 0:
         slope = max(0.0, float(np.cov(rows.T, bias=True)[0, 1] / rows[:, 0].var()))
-        if not rows[:, 1].std():
-            slope = 0.0
+    for name, found in seen.items():
+        size, latency = typical[name]
+        # What comes later than the quickest of its kind was delayed on its way, see _disturbed.
+        early = min(time - latency - slope * (bytes_ - size) for bytes_, time in found)
+        if early < -ROUNDING_NS:
+            typical[name] = size, latency + early
     return Transport(typical, slope)
+
+
+def _disturbed(trace: Trace, roots: Mapping[int, int], transport: Transport) -> dict[tuple[str, int], int | None]:
+    """Return what happened to messages on their way: a further delay in ns, or None for one that got lost.
+
+    A message is lost if nobody who takes its topic took it, though no queue dropped any and later ones were taken.
+    """
+    last_taken: dict[str, int] = {}
+    for message in trace.messages:
+        if message.kind == "topic" and message.id in trace.takers:
+            last_taken[message.name] = message.id
+    full = {topic for (_, topic), count in (*trace.dropped.items(), *trace.expired.items()) if count}
+    found: dict[tuple[str, int], int | None] = {}
+    for message in trace.messages:
+        if message.kind != "topic" or message.name not in last_taken:
+            continue
+        sender = trace.sender.get(message.id)
+        key = (message.name, message.released_ns if sender is None else roots[sender.id])
+        takers = trace.takers.get(message.id)
+        if takers:
+            expected = transport.latency_ns(message.name, message.size)
+            late = min(record.ready_ns for record in takers) - message.released_ns - expected
+            if late > ROUNDING_NS:
+                found[key] = late
+        elif message.name not in full and message.id < last_taken[message.name]:
+            found[key] = None
+    return found
 
 
 def _groups(trace: Trace, by_place: Mapping[Place, Sequence[CallbackRecord]]) -> dict[Place, int | None]:

@@ -202,6 +202,7 @@ class Model:
         transport: latency of messages.
         injected: what comes from outside.
         stamps: stamp of the messages of a topic by (topic, root), ns.
+        disturbed: by (topic, root), a message's further delay on its way in ns, or None if it got lost there.
         speed: how many times faster each resource is than when recorded.
         sizes: factor on the size of a topic's messages.
     """
@@ -214,6 +215,7 @@ class Model:
     transport: Transport
     injected: tuple[Injected, ...] = field(default=(), repr=False)
     stamps: Mapping[tuple[str, int], int] = field(default_factory=dict, repr=False)
+    disturbed: Mapping[tuple[str, int], int | None] = field(default_factory=dict, repr=False)
     speed: Mapping[str, float] = field(default_factory=dict)
     sizes: Mapping[str, float] = field(default_factory=dict)
 

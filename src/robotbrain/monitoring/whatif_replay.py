@@ -53,6 +53,8 @@ class _Player:
         self.clients: dict[str, int] = {}
         self.outstanding: Counter[tuple[str, str]] = Counter()
         self.stamps: dict[int, int] = {}
+        if model.disturbed:
+            self.context.add_filter("*", self._disturb)
         for stage in model.stages.values():
             _Runner(self, stage)
         for injected in model.injected:
@@ -91,6 +93,10 @@ class _Player:
     def _latency(self, name: str, size: int) -> int:
         kind, real = self.names.get(name, ("topic", name))
         return self.model.transport.latency_ns(real, size) if kind in ("topic", "request", "response") else 0
+
+    def _disturb(self, record: MessageRecord, data: bytes) -> list[tuple[bytes, int]]:
+        late = self.model.disturbed.get((record.name, HEAD.unpack_from(data)[0]), 0)
+        return [] if late is None else [(data, late)]
 
     def channel(self, kind: str, name: str, node: str = "") -> str:
         """Return the topic that stands for a service's requests, its answers to a node, or a timer's runs."""
