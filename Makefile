@@ -57,7 +57,7 @@ proof-bottlenecks: $(STAMP)  ## Find planted bottlenecks in generated pipelines,
 conformance-ros: $(STAMP)  ## Compare the kit with genuine ROS 2 (Linux x86-64; downloads about 1.7 GB once)
 	$(BIN)/python -m tests.conformance_ros
 	$(BIN)/python -m tests.conformance_ros.drive
-	ROBOTBRAIN_GENUINE_PYTHON=$(CURDIR)/build/conformance/kilted-drive/bin/python $(BIN)/python -m pytest tests/link/test_genuine.py
+	PYTHONPATH=$(CURDIR)/src ROBOTBRAIN_GENUINE_PYTHON=$(CURDIR)/build/conformance/kilted-drive/bin/python $(BIN)/python -m pytest tests/link/test_genuine.py
 
 profiles: $(STAMP)  ## Calibrate the Jetson twin and write the reference profiles again
 	$(BIN)/robotbrain jetson calibrate
