@@ -11,15 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from robotbrain.errors import InputError
+from robotbrain.monitoring.accuracy import wilson_interval
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 NOTHING = "none"
 """Name of the runs without a fault."""
-
-Z95 = 1.959963984540054
-"""Quantile of the normal distribution for 95 % intervals."""
 
 
 @dataclass(frozen=True)
@@ -77,8 +75,8 @@ class Summary:
         return self.successes / self.runs
 
 
-def wilson(successes: int, runs: int, z: float = Z95) -> tuple[float, float]:
-    """Return the score interval of a rate (E. B. Wilson, J. Am. Stat. Assoc. 22, 1927).
+def wilson(successes: int, runs: int) -> tuple[float, float]:
+    """Return the 95 % score interval of a rate; see :func:`~robotbrain.monitoring.accuracy.wilson_interval`.
 
     Raises:
         InputError: unless 0 <= successes <= runs and runs > 0.
@@ -87,10 +85,8 @@ def wilson(successes: int, runs: int, z: float = Z95) -> tuple[float, float]:
         raise InputError(
             "successes and runs", given=(successes, runs), expected="0 <= successes <= runs, runs > 0", fix="Count."
         )
-    rate = successes / runs
-    middle = (rate + z * z / (2 * runs)) / (1 + z * z / runs)
-    half = z / (1 + z * z / runs) * math.sqrt(rate * (1 - rate) / runs + z * z / (4 * runs * runs))
-    return max(0.0, middle - half), min(1.0, middle + half)
+    found = wilson_interval(successes, runs)
+    return found.low, found.high
 
 
 def mcnemar(lost: int, won: int) -> float:

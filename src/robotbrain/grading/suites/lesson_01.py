@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from robotbrain.grading import Suite, expect, fail
+from robotbrain.grading.suites.lesson_tools import answered
 
 suite = Suite("lesson_01")
 
@@ -40,20 +41,13 @@ for _key, _text in _HINTS.items():
     suite.hint(_key, _text)
 
 
-def _given(value: Any, name: str) -> Any:
-    """Return an answer; an ellipsis is one that is not yet given."""
-    if value is ...:
-        raise NotImplementedError(name)
-    return value
-
-
 # ---------------------------------------------------------------- 1
 
 
 @suite.test("traffic", points=2, name="edges worked out by hand", reread="Exercise 1")
 def _traffic(student: Any) -> None:
     for size, rate, count in ((500.0, 10.0, 300), (193_704.0, 2.0, 40), (52.0, 19.95, 435)):
-        got = _given(student.traffic_kbs(SimpleNamespace(mean_size=size, rate_hz=rate, count=count)), "traffic_kbs")
+        got = answered(student.traffic_kbs(SimpleNamespace(mean_size=size, rate_hz=rate, count=count)), "traffic_kbs")
         right = size * rate / 1000
         if isinstance(got, int | float) and math.isclose(got, right, rel_tol=1e-6):
             continue
@@ -179,7 +173,7 @@ def _choices(student: Any) -> None:
 
 
 def _line(student: Any, start: tuple[float, float], goal: tuple[float, float]) -> np.ndarray[Any, Any]:
-    points = np.asarray(_given(student.straight_line(start, goal), "straight_line"), dtype=float)
+    points = np.asarray(answered(student.straight_line(start, goal), "straight_line"), dtype=float)
     if points.ndim != 2 or points.shape[1] != 2:
         fail("straight_line should return an array of shape (N, 2)", got=points.shape, hint="spacing")
     return points

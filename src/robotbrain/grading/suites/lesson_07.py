@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from robotbrain.grading import Suite, expect, expect_close, fail
+from robotbrain.grading.suites.lesson_tools import answered
 
 suite = Suite("lesson_07")
 
@@ -67,16 +68,9 @@ for _key, _text in _HINTS.items():
     suite.hint(_key, _text)
 
 
-def _given(value: Any, name: str) -> Any:
-    """Return an answer; an ellipsis is one that is not yet given."""
-    if value is ...:
-        raise NotImplementedError(name)
-    return value
-
-
 def _number(value: Any, name: str) -> float:
     """Return a finite number that a student's function gave."""
-    found = _given(value, name)
+    found = answered(value, name)
     if isinstance(found, bool) or not isinstance(found, numbers.Real) or not math.isfinite(found):
         fail(f"`{name}` should return a number", got=found)
     return float(found)
@@ -107,7 +101,7 @@ _PACE_CASES: tuple[tuple[list[float], float], ...] = (
 
 
 def _pair(student: Any, steps: list[float], camera: float, pipelined: bool) -> tuple[float, float]:
-    got = _given(student.pace(list(steps), camera, pipelined), "pace")
+    got = answered(student.pace(list(steps), camera, pipelined), "pace")
     if not isinstance(got, tuple | list) or len(got) != 2:
         fail("`pace` should return two numbers: images per second, latency in ms", got=got, hint="order-of-the-pair")
     return _number(got[0], "pace"), _number(got[1], "pace")
@@ -185,7 +179,7 @@ _WAKEUP_MISTAKES: tuple[tuple[str, Callable[[int, int, int], int]], ...] = (
 def _check_wakeup(student: Any, cases: Sequence[tuple[int, int, int]]) -> None:
     answers = []
     for due, now, period in cases:
-        got = _given(student.next_wakeup(due, now, period), "next_wakeup")
+        got = answered(student.next_wakeup(due, now, period), "next_wakeup")
         if isinstance(got, bool) or not isinstance(got, numbers.Integral):
             kind = f"{got} ({type(got).__name__})"
             fail("`next_wakeup` should return a whole number of ns", got=kind, hint="whole-nanoseconds")
@@ -413,7 +407,7 @@ def _speed_limits(student: Any) -> None:
             got = student.largest_speed(age, 0.0, 1.0)
         except ZeroDivisionError:
             got = math.nan
-        got = float(_given(got, "largest_speed")) if isinstance(got, numbers.Real) else _given(got, "largest_speed")
+        got = float(answered(got, "largest_speed")) if isinstance(got, numbers.Real) else answered(got, "largest_speed")
         expect(got == 0, f"data {age:g} s old, nothing free: the speed is 0", got=got, hint="no-way-no-speed")
     expect_close(
         student.largest_speed(0.0, 2.0, 1.0), np.sqrt(4.0), what="with fresh data: the brakes alone, sqrt(2 a d)"

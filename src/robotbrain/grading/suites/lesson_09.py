@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from robotbrain.grading import Suite, expect, fail
+from robotbrain.grading.suites.lesson_tools import answered, equals
 
 suite = Suite("lesson_09")
 
@@ -42,24 +43,11 @@ for _key, _text in _HINTS.items():
     suite.hint(_key, _text)
 
 
-def _given(value: Any, name: str) -> Any:
-    """Return an answer; an ellipsis is one that is not yet given."""
-    if value is ...:
-        raise NotImplementedError(name)
-    return value
-
-
-def _is(got: Any, right: float) -> bool:
-    if isinstance(got, bool) or not isinstance(got, int | float | np.floating | np.integer):
-        return False
-    return math.isnan(got) if math.isnan(right) else math.isclose(got, right, rel_tol=1e-6, abs_tol=1e-9)
-
-
 # ---------------------------------------------------------------- 1
 
 
 def _pair(student: Any, times: Any, deadline: float) -> tuple[Any, Any]:
-    got = _given(student.late(times, deadline), "late")
+    got = answered(student.late(times, deadline), "late")
     if not (isinstance(got, tuple | list | np.ndarray) and len(got) == 2):
         fail("`late` should return two numbers: the share of late calls, and the 99th percentile", got=got)
     return got[0], got[1]
@@ -70,20 +58,20 @@ def _late_counted(student: Any) -> None:
     for times, deadline in (([10.0, 50.0, 51.0, 90.0], 50.0), ([5.0] * 8 + [200.0] * 2, 100.0), ([3.0], 5.0)):
         share, p99 = _pair(student, np.array(times), deadline)
         right = sum(t > deadline for t in times) / len(times)
-        if not _is(share, right):
-            hint = "share-not-count" if _is(share, right * len(times)) else ""
-            if _is(share, sum(t >= deadline for t in times) / len(times)):
+        if not equals(share, right):
+            hint = "share-not-count" if equals(share, right * len(times)) else ""
+            if equals(share, sum(t >= deadline for t in times) / len(times)):
                 hint = "on-time-is-in-time"
             fail(f"of {times} ms with a deadline of {deadline:g} ms the share {right:g} is late", got=share, hint=hint)
         wanted = float(np.percentile(times, 99))
-        expect(_is(p99, wanted), f"the 99th percentile of {times} is {wanted:g} ms, not {p99}", hint="not-the-mean")
+        expect(equals(p99, wanted), f"the 99th percentile of {times} is {wanted:g} ms, not {p99}", hint="not-the-mean")
 
 
 @suite.test("late", points=1, name="no calls at all", reread="Exercise 1, last sentence")
 def _late_empty(student: Any) -> None:
     share, p99 = _pair(student, np.array([]), 50.0)
     expect(
-        _is(share, math.nan) and _is(p99, math.nan),
+        equals(share, math.nan) and equals(p99, math.nan),
         "without any calls both numbers are unknown",
         got=(share, p99),
         hint="unknown-is-not-zero",
@@ -96,18 +84,18 @@ def _late_empty(student: Any) -> None:
 @suite.test("little", points=1, name="queues worked out by hand", reread="Queues")
 def _little(student: Any) -> None:
     for depth, rate in ((2.0, 10.0), (0.5, 50.0), (5.4, 49.9)):
-        got = _given(student.mean_wait_ms(depth, rate), "mean_wait_ms")
+        got = answered(student.mean_wait_ms(depth, rate), "mean_wait_ms")
         right = 1000 * depth / rate
-        if _is(got, right):
+        if equals(got, right):
             continue
-        hint = "milliseconds" if _is(got, right / 1000) else "wait-is-depth-over-rate"
+        hint = "milliseconds" if equals(got, right / 1000) else "wait-is-depth-over-rate"
         fail(f"{depth:g} messages on average at {rate:g} a second wait {right:g} ms", got=got, hint=hint)
 
 
 @suite.test("little", points=1, name="a queue that nothing passes through", reread="Exercise 2")
 def _little_zero(student: Any) -> None:
-    got = _given(student.mean_wait_ms(3.0, 0.0), "mean_wait_ms")
-    expect(_is(got, math.nan), "at a rate of 0 there is no waiting time", got=got, hint="unknown-is-not-zero")
+    got = answered(student.mean_wait_ms(3.0, 0.0), "mean_wait_ms")
+    expect(equals(got, math.nan), "at a rate of 0 there is no waiting time", got=got, hint="unknown-is-not-zero")
 
 
 # ---------------------------------------------------------------- 3
@@ -125,9 +113,9 @@ def _psi_values(student: Any) -> None:
     cases = [([50, 30, 20], [50, 30, 20]), ([50, 30, 20], [100, 60, 40]), ([50, 30, 20], [20, 30, 50])]
     cases += [(rng.integers(1, 900, 4).tolist(), rng.integers(1, 900, 4).tolist()) for _ in range(4)]
     for before, now in cases:
-        got = _given(student.psi(before, now), "psi")
+        got = answered(student.psi(before, now), "psi")
         right = _psi(before, now)
-        if _is(got, right):
+        if equals(got, right):
             continue
         hint = "both-factors"
         if sum(before) != sum(now):
@@ -142,9 +130,9 @@ def _psi_values(student: Any) -> None:
 @suite.test("psi", points=1, name="a class that was never seen", reread="Exercise 3")
 def _psi_floor(student: Any) -> None:
     for before, now in (([90, 10, 0], [80, 10, 10]), ([0, 50, 50], [0, 60, 40])):
-        got = _given(student.psi(before, now), "psi")
+        got = answered(student.psi(before, now), "psi")
         right = _psi(before, now)
-        expect(_is(got, right), f"the index of {before} and {now} is {right:.4f}", got=got, hint="floor-the-shares")
+        expect(equals(got, right), f"the index of {before} and {now} is {right:.4f}", got=got, hint="floor-the-shares")
 
 
 # ---------------------------------------------------------------- 4
@@ -153,18 +141,18 @@ def _psi_floor(student: Any) -> None:
 @suite.test("amdahl", points=1, name="chains worked out by hand", reread="Exercise 4")
 def _amdahl(student: Any) -> None:
     for total, part, factor in ((100.0, 50.0, 2.0), (280.0, 20.0, 4.0), (60.0, 60.0, 3.0)):
-        got = _given(student.after_ms(total, part, factor), "after_ms")
+        got = answered(student.after_ms(total, part, factor), "after_ms")
         right = total - part + part / factor
-        if _is(got, right):
+        if equals(got, right):
             continue
-        hint = "factor-divides" if _is(got, total - part + part * factor) else "rest-stays"
+        hint = "factor-divides" if equals(got, total - part + part * factor) else "rest-stays"
         fail(f"of {total:g} ms, {part:g} ms made {factor:g} times as fast leave {right:g} ms", got=got, hint=hint)
 
 
 @suite.test("amdahl", points=1, name="at most", reread="Exercise 4")
 def _amdahl_limit(student: Any) -> None:
-    got = _given(student["best_ms"], "best_ms")
-    expect(_is(got, 260.0), "a chain of 280 ms whose part of 20 ms vanishes", got=got, hint="infinitely-fast")
+    got = answered(student["best_ms"], "best_ms")
+    expect(equals(got, 260.0), "a chain of 280 ms whose part of 20 ms vanishes", got=got, hint="infinitely-fast")
 
 
 # ---------------------------------------------------------------- 5

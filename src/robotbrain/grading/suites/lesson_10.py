@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from robotbrain.grading import Suite, expect, fail
+from robotbrain.grading.suites.lesson_tools import answered, equals
 
 suite = Suite("lesson_10")
 
@@ -51,19 +52,6 @@ for _key, _text in _HINTS.items():
     suite.hint(_key, _text)
 
 
-def _given(value: Any, name: str) -> Any:
-    """Return an answer; an ellipsis is one that is not yet given."""
-    if value is ...:
-        raise NotImplementedError(name)
-    return value
-
-
-def _is(got: Any, right: float) -> bool:
-    if isinstance(got, bool) or not isinstance(got, int | float | np.floating | np.integer):
-        return False
-    return math.isnan(got) if math.isnan(right) else math.isclose(got, right, rel_tol=1e-6, abs_tol=1e-9)
-
-
 # ---------------------------------------------------------------- 1
 
 
@@ -91,7 +79,7 @@ def _yaw_hint(got: Any, right: float, plain: float) -> str:
 def _yaw_pairs(student: Any) -> None:
     cases = [(10, 4), (-20, 5), (-179, 179), (179, -179), (90, -170), (0, 180), (720, 3)]
     for estimated, true in cases:
-        got = _given(student.yaw_error(math.radians(estimated), math.radians(true)), "yaw_error")
+        got = answered(student.yaw_error(math.radians(estimated), math.radians(true)), "yaw_error")
         plain = math.radians(estimated) - math.radians(true)
         right = math.atan2(math.sin(plain), math.cos(plain))
         if not _same_angle(got, right):
@@ -106,7 +94,7 @@ def _yaw_pairs(student: Any) -> None:
 def _yaw_arrays(student: Any) -> None:
     estimated, true = np.radians([179.0, 10.0, -170.0]), np.radians([-179.0, 5.0, 175.0])
     try:
-        got = _given(student.yaw_error(estimated, true), "yaw_error")
+        got = answered(student.yaw_error(estimated, true), "yaw_error")
     except (TypeError, ValueError) as error:
         fail(f"for arrays it says: {error}", hint="works-for-arrays")
     right = np.radians([-2.0, 5.0, 15.0])
@@ -121,11 +109,11 @@ def _yaw_arrays(student: Any) -> None:
 @suite.test("full", points=1, name="queues worked out by hand", reread="Trouble 4")
 def _full_grows(student: Any) -> None:
     for free, frame, arrival, service in ((100.0, 1.0, 10.0, 5.0), (4000.0, 0.5, 30.0, 22.0), (60.0, 2.0, 3.0, 0.0)):
-        got = _given(student.seconds_until_full(free, frame, arrival, service), "seconds_until_full")
+        got = answered(student.seconds_until_full(free, frame, arrival, service), "seconds_until_full")
         right = free / (frame * (arrival - service))
-        if _is(got, right):
+        if equals(got, right):
             continue
-        hint = "frames-have-size" if _is(got, right * frame) else "the-difference-grows"
+        hint = "frames-have-size" if equals(got, right * frame) else "the-difference-grows"
         fail(
             f"{free:g} MB fill in {right:g} s, if frames of {frame:g} MB come {arrival:g} times a second and "
             f"{service:g} are worked off",
@@ -138,11 +126,11 @@ def _full_grows(student: Any) -> None:
 def _full_never(student: Any) -> None:
     for arrival, service in ((10.0, 20.0), (10.0, 10.0)):
         try:
-            got = _given(student.seconds_until_full(100.0, 1.0, arrival, service), "seconds_until_full")
+            got = answered(student.seconds_until_full(100.0, 1.0, arrival, service), "seconds_until_full")
         except ZeroDivisionError:
             got = "a division by zero"
         expect(
-            _is(got, math.inf),
+            equals(got, math.inf),
             f"{arrival:g} frames come and {service:g} could be worked off a second: it never fills up",
             got=got,
             hint="never-is-infinite",
@@ -155,14 +143,14 @@ def _full_never(student: Any) -> None:
 @suite.test("energy", points=1, name="periods worked out by hand", reread="Exercise 3")
 def _energy(student: Any) -> None:
     for busy, idle, work, period in ((10.0, 3.0, 20.0, 100.0), (6.5, 1.5, 3.0, 50.0), (15.0, 5.0, 40.0, 40.0)):
-        got = _given(student.period_mj(busy, idle, work, period), "period_mj")
+        got = answered(student.period_mj(busy, idle, work, period), "period_mj")
         right = busy * work + idle * (period - work)
-        if _is(got, right):
+        if equals(got, right):
             continue
         hint = "rest-is-idle"
-        if _is(got, right / 1000) or _is(got, right * 1000):
+        if equals(got, right / 1000) or equals(got, right * 1000):
             hint = "watt-milliseconds"
-        elif _is(got, busy * work + idle * period):
+        elif equals(got, busy * work + idle * period):
             hint = "idle-only-rests"
         elif isinstance(got, float) and math.isnan(got):
             hint = "just-fits"
@@ -175,15 +163,15 @@ def _energy(student: Any) -> None:
 
 @suite.test("energy", points=1, name="work that does not fit", reread="Exercise 3, last sentence")
 def _energy_too_long(student: Any) -> None:
-    got = _given(student.period_mj(10.0, 3.0, 120.0, 100.0), "period_mj")
-    expect(_is(got, math.nan), "120 ms of work do not fit into 100 ms", got=got, hint="does-not-fit")
+    got = answered(student.period_mj(10.0, 3.0, 120.0, 100.0), "period_mj")
+    expect(equals(got, math.nan), "120 ms of work do not fit into 100 ms", got=got, hint="does-not-fit")
 
 
 # ---------------------------------------------------------------- 4
 
 
 def _point(student: Any, point: tuple[float, float], mount: tuple[float, float, float]) -> np.ndarray[Any, Any]:
-    got = _given(student.to_base(point, mount), "to_base")
+    got = answered(student.to_base(point, mount), "to_base")
     try:
         values = np.asarray(got, dtype=float)
     except (TypeError, ValueError):
@@ -256,7 +244,7 @@ def _verdicts(student: Any) -> None:
 def _brighter(student: Any) -> None:
     image = np.array([[0, 10, 200], [250, 255, 128]], np.uint8)
     for amount in (20, -20, 0, 300, -300):
-        got = _given(student.brighter(image.copy(), amount), "brighter")
+        got = answered(student.brighter(image.copy(), amount), "brighter")
         right = np.clip(image.astype(int) + amount, 0, 255)
         same = np.shape(got) == right.shape and np.allclose(got, right)
         expect(
@@ -293,7 +281,7 @@ def _keep(student: Any) -> None:
 @suite.test("repairs", points=1, name="to_network", reread="The silent-bug clinic")
 def _to_network(student: Any) -> None:
     image = np.arange(2 * 4 * 3, dtype=np.uint8).reshape(2, 4, 3)
-    got = _given(student.to_network(image.copy()), "to_network")
+    got = answered(student.to_network(image.copy()), "to_network")
     right = np.stack([image[..., channel] for channel in range(3)])
     hint = "height-then-width" if np.shape(got) == (3, 4, 2) else "move-the-axis"
     same = np.shape(got) == right.shape and np.array_equal(got, right)
