@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint format lab labs train bench profiles proof-drive proof-devices proof-bottlenecks conformance-ros mutation-test clean
+.PHONY: help install demo test lint format lab labs train bench profiles proof-drive proof-devices proof-bottlenecks proof-reach proof-velocity proof-gap conformance-ros conformance-isaaclab mutation-test clean
 
 help:  ## Show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-15s %s\n", $$1, $$2}'
@@ -54,10 +54,24 @@ proof-devices: $(STAMP)  ## Drive the same 20 worlds on five Jetsons (about twen
 proof-bottlenecks: $(STAMP)  ## Find planted bottlenecks in generated pipelines, and check what the cure was said to bring
 	$(BIN)/python benchmarks/bottlenecks.py
 
+proof-reach: $(STAMP)  ## Learn to reach, five seeds, against Stable-Baselines3 (hours; goes on where it was stopped)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[peers]"
+	$(BIN)/python benchmarks/rl_reach.py
+	$(BIN)/python benchmarks/rl_gymnasium.py
+
+proof-velocity: $(STAMP)  ## Let the shipped walking policy follow 200 unseen commands, with and without pushes
+	$(BIN)/python benchmarks/rl_velocity.py
+
+proof-gap: $(STAMP)  ## Train with and without randomisation and compare on surrogate arms (about half an hour)
+	$(BIN)/python benchmarks/rl_sim_to_real.py
+
 conformance-ros: $(STAMP)  ## Compare the kit with genuine ROS 2 (Linux x86-64; downloads about 1.7 GB once)
 	$(BIN)/python -m tests.conformance_ros
 	$(BIN)/python -m tests.conformance_ros.drive
 	PYTHONPATH=$(CURDIR)/src ROBOTBRAIN_GENUINE_PYTHON=$(CURDIR)/build/conformance/kilted-drive/bin/python $(BIN)/python -m pytest tests/link/test_genuine.py
+
+conformance-isaaclab: $(STAMP)  ## Compare the tasks' terms with genuine Isaac Lab 3.0 (downloads its wheel once)
+	$(BIN)/python -m tests.conformance_isaaclab
 
 profiles: $(STAMP)  ## Calibrate the Jetson twin and write the reference profiles again
 	$(BIN)/robotbrain jetson calibrate
@@ -65,6 +79,7 @@ profiles: $(STAMP)  ## Calibrate the Jetson twin and write the reference profile
 
 mutation-test: $(STAMP)  ## Test the tests of the labs with named wrong solutions
 	$(BIN)/robotbrain mutation-test lab_integration --jobs 2
+	$(BIN)/robotbrain mutation-test hw1_rl --jobs 2
 	$(BIN)/robotbrain mutation-test hw3_performance --jobs 2
 
 bench: $(STAMP)  ## Run the benchmarks; each prints one table
@@ -75,6 +90,7 @@ bench: $(STAMP)  ## Run the benchmarks; each prints one table
 	$(BIN)/python benchmarks/patterns.py
 	$(BIN)/python benchmarks/jitter.py
 	$(BIN)/python benchmarks/monitoring_overhead.py
+	$(BIN)/python benchmarks/rl_stepping.py
 
 clean:  ## Remove .venv, caches and generated pages
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache demo build dist

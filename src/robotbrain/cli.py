@@ -34,6 +34,7 @@ COMMANDS: dict[str, Command] = {
     "lab": Command("robotbrain.jupyter", "open JupyterLab on the course"),
     "monitor": Command("robotbrain.monitoring.commands:monitor", "watch a brain drive, or this machine"),
     "jetson": Command("robotbrain.jetson.commands:jetson", "what a network takes on a Jetson module: the twin"),
+    "rl": Command("robotbrain.rl.commands:rl", "reinforcement learning: tasks, training, evaluation, export"),
     "train": Command("robotbrain.training.commands:train", "train a shipped network again"),
     "grade": Command("robotbrain.grading.commands:grade", "grade one notebook and print the report"),
     "grade-class": Command("robotbrain.grading.commands:grade_class", "grade all submissions of a lab"),

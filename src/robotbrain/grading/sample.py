@@ -1,7 +1,8 @@
 """A made-up class to try grading on: right answers in several styles, named wrong ones, and accidents of every kind.
 
 ``autograder/mutants/<lab>/mutants.py`` defines ``MUTANTS`` (and may define ``STYLES``), ``styles.py`` beside it
-``STYLES``. A replacement is a whole new cell, or a list of ``(old, new)`` edits of the reference answer.
+``STYLES``. A replacement is a whole new cell, or a list of ``(old, new)`` edits of the reference answer. What is to be
+handed in beside the notebook (a trained policy, say) lies in ``autograder/reference/<lab>/``.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import json
 import re
 import shutil
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ import nbformat
 from nbformat.notebooknode import NotebookNode
 
 from robotbrain.errors import InputError
-from robotbrain.files import write_text
+from robotbrain.files import write_bytes, write_text
 from robotbrain.grading import intake
 from robotbrain.grading.course import Course
 from robotbrain.grading.marks import SCORED
@@ -83,6 +84,8 @@ class Mutant:
         loses: points it costs in ``exercise``; None: any number above 0.
         replace: grade id of an answer cell -> its new source, or edits of the reference answer.
         also: further exercises that may lose points, for mistakes that do spread.
+        files: name of a file beside the notebook -> its content, made from the folder of the reference files; None
+            where it is missing.
     """
 
     name: str
@@ -92,6 +95,7 @@ class Mutant:
     replace: Mapping[str, Replacement]
     loses: float | None = None
     also: tuple[str, ...] = ()
+    files: Mapping[str, Callable[[Path], bytes | None]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -206,20 +210,27 @@ def make_class(course: Course, lab: str, out: Path) -> dict[str, dict[str, Any]]
     """
     reference = Reference(course, lab)
     mutants, styles = load_mutants(course, lab)
-    entries: list[tuple[dict[str, Any], Mapping[str, NotebookNode | str]]] = []
+    folder = course.autograder / "reference" / lab
+    beside = {p.name: p.read_bytes() for p in sorted(folder.iterdir()) if p.is_file()} if folder.is_dir() else {}
+    entries: list[tuple[dict[str, Any], Mapping[str, NotebookNode | str | bytes]]] = []
 
-    def add(kind: str, name: str, expect: str, files: Mapping[str, NotebookNode | str], **more: Any) -> None:
-        entries.append(({"kind": kind, "name": name, "expect": expect, **more}, files))
+    def add(kind: str, name: str, expect: str, files: Mapping[str, NotebookNode | str | bytes], **more: Any) -> None:
+        without = more.pop("without", [])
+        handed_in = {} if expect == "zero" else {k: v for k, v in beside.items() if k not in without}
+        entries.append(({"kind": kind, "name": name, "expect": expect, **more}, {**handed_in, **files}))
 
     add("reference", "reference", "full", reference.copy())
     for style in styles:
         add("style", style.name, "full", reference.edit(style.replace, f"style {style.name}"))
     for mutant in mutants:
+        made = {name: make(folder) for name, make in mutant.files.items()}
+        changed = {name: data for name, data in made.items() if data is not None}
         add(
             "mutant",
             mutant.name,
             "exercise",
-            reference.edit(mutant.replace, f"mutant {mutant.name}"),
+            {**reference.edit(mutant.replace, f"mutant {mutant.name}"), **changed},
+            without=[name for name in made if name not in changed],
             exercise=mutant.exercise,
             hint=mutant.hint,
             loses=mutant.loses,
@@ -233,11 +244,14 @@ def make_class(course: Course, lab: str, out: Path) -> dict[str, dict[str, Any]]
         names = _STUDENTS[: len(entries)]
     manifest = {}
     for student, (entry, files) in zip(names, entries, strict=True):
-        folder = out / student / lab
+        target = out / student / lab
         shutil.rmtree(out / student, ignore_errors=True)
-        folder.mkdir(parents=True)
+        target.mkdir(parents=True)
         for name, content in files.items():
-            write_text(folder / name, content if isinstance(content, str) else nbformat.writes(content))
+            if isinstance(content, bytes):
+                write_bytes(target / name, content)
+            else:
+                write_text(target / name, content if isinstance(content, str) else nbformat.writes(content))
         manifest[student] = entry
     write_text(out / MANIFEST, json.dumps({"lab": lab, "students": manifest}, indent=1) + "\n")
     return manifest

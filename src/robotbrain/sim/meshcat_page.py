@@ -35,10 +35,11 @@ class MeshcatPage:
 
     Args:
         title: of the page.
+        caption: a line of text above the scene; none by default.
     """
 
-    def __init__(self, title: str) -> None:
-        self.title = title
+    def __init__(self, title: str, caption: str = "") -> None:
+        self.title, self.caption = title, caption
         self._commands: list[bytes] = []
         self._clips: dict[str, AnimationClip] = {}
         self._ids = 0
@@ -94,6 +95,13 @@ class MeshcatPage:
             clip.set_property(t, "position", "vector3", [_short(pose.x), _short(pose.y), 0.0])
             clip.set_property(t, "quaternion", "quaternion", turn)
 
+    def animate(self, path: str, times_s: Array, positions: Array, quaternions: Array) -> None:
+        """Move a node through ``positions`` (n, 3), m, and ``quaternions`` (n, 4), xyzw, at ``times_s`` (n,)."""
+        clip = self._clip(path)
+        for t, place, turn in zip(times_s.tolist(), positions, quaternions, strict=True):
+            clip.set_property(t, "position", "vector3", [_short(v) for v in place])
+            clip.set_property(t, "quaternion", "quaternion", [_short(v) for v in turn])
+
     def animate_visible(self, path: str, changes: list[tuple[float, bool]]) -> None:
         """Show and hide a node at the given times (s)."""
         for t, shown in changes:
@@ -107,7 +115,9 @@ class MeshcatPage:
             commands.append(_pack(SetAnimation(animation, play=True, repetitions=10_000)))
         script = (FilePath(meshcat.viewer_assets_path()) / "dist" / "main.min.js").read_text(encoding="utf-8")
         data = json.dumps([base64.b64encode(command).decode("ascii") for command in commands])
-        return _PAGE.replace("@TITLE@", html.escape(self.title)).replace("@DATA@", data).replace("@VIEWER@", script)
+        line = f'<p id="caption">{html.escape(self.caption)}</p>' if self.caption else ""
+        page = _PAGE.replace("@TITLE@", html.escape(self.title)).replace("@CAPTION@", line)
+        return page.replace("@DATA@", data).replace("@VIEWER@", script)
 
     def _clip(self, path: str) -> AnimationClip:
         # one frame a second: key times are then seconds
@@ -190,8 +200,10 @@ def _short(value: float) -> float:
 _PAGE = """<!DOCTYPE html>
 <html lang="en">
 <head><meta charset="utf-8"><title>@TITLE@</title>
-<style>body{margin:0}#view{width:100vw;height:100vh;overflow:hidden}</style></head>
-<body><div id="view"></div>
+<style>body{margin:0}#view{width:100vw;height:100vh;overflow:hidden}
+#caption{position:fixed;top:0;left:0;z-index:1;margin:0;padding:8px 14px;font:15px sans-serif;
+background:rgba(255,255,255,.85);color:#1b1b1b}</style></head>
+<body>@CAPTION@<div id="view"></div>
 <script>@VIEWER@</script>
 <script>
 const viewer = new MeshCat.Viewer(document.getElementById("view"));

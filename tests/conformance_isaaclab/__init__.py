@@ -1,0 +1,1 @@
+"""The kit's terms, configurations and exported tasks against genuine Isaac Lab: ``make conformance-isaaclab``."""

@@ -1,0 +1,310 @@
+"""Homework 1 itself: generated from its solution, its tests tested by named wrong solutions, its story true."""
+
+from __future__ import annotations
+
+import copy
+import shutil
+from pathlib import Path
+from typing import Any
+
+import nbformat
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from robotbrain.grading import CheckFailure, Suite, load_hidden_suite, mutation
+from robotbrain.grading.classroom import ClassResult, grade_class
+from robotbrain.grading.course import find_course, release_differences
+from robotbrain.grading.sample import load_mutants, make_class
+from robotbrain.grading.suites import hw1_rl_evidence as evidence
+from robotbrain.grading.suites import hw1_rl_learning as learning
+from robotbrain.grading.suites import hw1_rl_memory as memory
+from robotbrain.grading.suites import hw1_rl_policy as policy
+from robotbrain.grading.suites import hw1_rl_tools as tools
+from tests.conftest import graders
+
+LAB = "hw1_rl"
+
+
+@pytest.fixture(scope="module")
+def suite(repo: Path) -> Suite:
+    return load_hidden_suite(LAB, repo / "autograder")
+
+
+@pytest.fixture(scope="module")
+def handed_in(repo: Path) -> Path:
+    return repo / "autograder" / "reference" / LAB
+
+
+def test_labs_is_what_solutions_generates(repo: Path, tmp_path: Path) -> None:
+    assert release_differences(find_course(repo), LAB, tmp_path) == []
+
+
+def test_the_released_lab_holds_no_answer_no_hidden_test_and_no_policy(repo: Path) -> None:
+    text = (repo / "labs" / LAB / f"{LAB}.ipynb").read_text(encoding="utf-8")
+    for secret in (
+        "BEGIN SOLUTION",
+        "HIDDEN TESTS",
+        "hidden=True",
+        "copy.deepcopy(actor)",
+        '"a": "breaks"',
+        "np.hypot",
+    ):
+        assert secret not in text, secret
+    assert text.count("raise NotImplementedError()") >= 15
+    assert not list((repo / "labs" / LAB).glob("*.onnx"))
+
+
+def test_points_agree_between_notebook_and_tests(repo: Path, suite: Suite) -> None:
+    notebook = nbformat.read(repo / "solutions" / LAB / f"{LAB}.ipynb", as_version=4)
+    graded = [c for c in notebook.cells if c.metadata.get("nbgrader", {}).get("grade")]
+    automatic = sum(c.metadata.nbgrader.points for c in graded if c.cell_type == "code")
+    by_hand = sum(c.metadata.nbgrader.points for c in graded if c.cell_type == "markdown")
+    assert automatic == sum(e.points for e in suite.exercises.values()) == 92
+    assert by_hand == 8
+    text = "\n".join(c.source for c in notebook.cells)
+    for exercise in suite.exercises.values():
+        number, _, name = exercise.title.partition(" ")
+        assert f"### Exercise {number}: {name[0].lower()}{name[1:]} ({exercise.points:g} points)" in text
+
+
+def test_nothing_is_trained_while_grading(repo: Path) -> None:
+    notebook = nbformat.read(repo / "solutions" / LAB / f"{LAB}.ipynb", as_version=4)
+    for cell in notebook.cells:
+        if cell.cell_type == "code" and ("= train(" in cell.source or "export_policy(" in cell.source):
+            assert "skip-grading" in cell.metadata.get("tags", []), cell.id
+
+
+def test_every_hint_and_every_mutant_is_of_use(repo: Path, suite: Suite) -> None:
+    mutants, styles = load_mutants(find_course(repo), LAB)
+    assert len(mutants) >= 25 and len(styles) == 3
+    assert {m.hint for m in mutants} <= set(suite.hints)
+    assert {m.exercise for m in mutants} == set(suite.exercises)
+    parts = ("", "_evidence", "_learning", "_memory", "_policy", "_tools")
+    files = [f"src/robotbrain/grading/suites/{LAB}{part}.py" for part in parts]
+    tests = "".join((repo / name).read_text(encoding="utf-8") for name in [*files, f"autograder/hidden/{LAB}.py"])
+    assert [key for key in suite.hints if tests.count(f'"{key}"') < 2] == []
+
+
+# ---------------------------------------------------------------- the oracles against mathematics and peers
+
+
+def test_the_closed_form_is_what_simulation_of_the_problem_earns() -> None:
+    rng = np.random.default_rng(0)
+    problem = learning.random_problem(rng)
+    x, u = rng.uniform(-1, 1, (2, 2))
+    z = np.concatenate([x, u])
+    expected, earned, discount = -z @ problem.hessian @ z, 0.0, 1.0
+    for _ in range(400):
+        earned -= discount * (x @ problem.s @ x + u @ problem.r @ u)
+        x, discount = problem.a @ x + problem.b @ u, discount * problem.gamma
+        u = -problem.gain @ x
+    assert earned == pytest.approx(expected, rel=1e-6)
+    # And no other action is better: the gradient of Q by u vanishes at u = -K x.
+    h, n = problem.hessian, len(x)
+    assert h[n:, :n] == pytest.approx(h[n:, n:] @ problem.gain, abs=1e-6)
+
+
+def test_finite_differences_are_derivatives() -> None:
+    actor, critic = learning.networks(3)
+    batch = tools.random_batch(torch.Generator().manual_seed(1), 8, learning.OBS, learning.ACT)
+    tools.actor_loss(actor, critic, batch).backward()
+
+    def value() -> float:
+        with torch.no_grad():
+            return float(tools.actor_loss(actor, critic, batch))
+
+    for parameter, found in zip(actor.parameters(), tools.finite_differences(value, actor), strict=True):
+        assert parameter.grad is not None
+        torch.testing.assert_close(found, parameter.grad, rtol=0.02, atol=2e-3)
+
+
+def test_our_bounds_are_those_of_scipy() -> None:
+    from scipy.stats import binomtest
+
+    for k, n in ((0, 20), (1, 3), (95, 100), (20, 20)):
+        test = binomtest(k, n, alternative="greater")
+        assert evidence.exact_bound(k, n) == pytest.approx(test.proportion_ci(0.95, method="exact").low, abs=1e-9)
+        wilson = binomtest(k, n).proportion_ci(0.95, method="wilson")
+        assert evidence.wilson(k, n) == pytest.approx((wilson.low, wilson.high), abs=1e-4)
+    # What the notebook says of the threshold, and that a policy that reaches 92 % hardly ever fails by bad luck.
+    assert evidence.exact_bound(266, 300) >= policy.SIMULATION_BOUND > evidence.exact_bound(265, 300)
+    from scipy.stats import binom
+
+    assert binom.cdf(265, 300, 0.93) < 1e-2 and binom.cdf(265, 300, 0.95) < 1e-5
+
+
+def test_the_interval_of_the_gap_covers_the_gap_as_often_as_it_says() -> None:
+    rng = np.random.default_rng(1)
+    p, q, hits = 0.95, 0.7, 0
+    for _ in range(500):
+        _, low, high = evidence.newcombe((rng.random(100) < p).tolist(), (rng.random(80) < q).tolist())
+        hits += low <= p - q <= high
+    assert 0.92 <= hits / 500 <= 0.99
+
+
+def test_random_tests_pass_our_own_answers_whatever_the_seed() -> None:
+    class Buffer:
+        def __init__(self, capacity: int, obs_dim: int, act_dim: int) -> None:
+            widths = ((obs_dim,), (act_dim,), (), (obs_dim,), ())
+            self.arrays = [np.zeros((capacity, *w), dtype=np.float32) for w in widths]
+            self.capacity, self.count = capacity, 0
+
+        def __len__(self) -> int:
+            return min(self.count, self.capacity)
+
+        def add(self, *fields: Any) -> None:
+            rows = (self.count + np.arange(len(fields[2]))) % self.capacity
+            for array, values in zip(self.arrays, fields, strict=True):
+                array[rows] = values
+            self.count += len(fields[2])
+
+        def sample(self, size: int) -> tools.Batch:
+            rows = torch.randint(len(self), (size,)).numpy()
+            return tools.Batch(*(torch.from_numpy(array[rows]) for array in self.arrays))
+
+    for seed in range(6):
+        with tools.seeded(seed):
+            memory.compare_uniform(Buffer, times=200)
+            memory.compare_content(Buffer, 10, [4, 4, 4, 4])
+            learning.compare_noise(tools.select_action)
+            learning.compare_independent(tools.select_action)
+            learning.compare_agent_acts(tools.Agent)
+        learning.compare_update(tools.Agent, seed, 4)
+
+
+def test_typical_mistakes_of_an_update_can_be_told_apart() -> None:
+    for seed, updates in ((41, 3), (7, 6), (100, 6)):  # the first is the visible test's
+        for key, steps in learning.VARIANTS:
+
+            def wrong(*networks: Any, steps: tools.Steps = steps, **settings: Any) -> tools.Agent:
+                return tools.Agent(*networks, **settings, steps=steps)
+
+            with pytest.raises(CheckFailure) as caught:
+                learning.compare_update(wrong, seed, updates)
+            assert caught.value.hint == key
+
+
+# ---------------------------------------------------------------- what the homework tells
+
+
+def test_what_part_1_says_of_detach_and_of_the_critics_gradients_is_true() -> None:
+    def outline(detach: bool, freeze: bool) -> tuple[torch.Tensor, bool]:
+        """Update as the outline does; return all weights, and whether a target network got gradients."""
+        networks = [copy.deepcopy(n) for n in learning.networks(3)]
+        (actor, critic), (slow_actor, slow_critic) = networks, [copy.deepcopy(n) for n in networks]
+        optimisers = [torch.optim.Adam(n.parameters(), lr=1e-2) for n in networks]
+        generator = torch.Generator().manual_seed(0)
+        for _ in range(5):
+            batch = tools.random_batch(generator, 16, learning.OBS, learning.ACT)
+            future = slow_critic(batch.next_obs, slow_actor(batch.next_obs)).squeeze(1)
+            target = batch.reward + 0.9 * (1 - batch.terminated) * (future.detach() if detach else future)
+            optimisers[1].zero_grad()
+            nn.functional.mse_loss(critic(batch.obs, batch.action).squeeze(1), target).backward()  # type: ignore[no-untyped-call]
+            optimisers[1].step()
+            optimisers[0].zero_grad()
+            loss = tools.actor_loss(actor, critic, batch) if freeze else -critic(batch.obs, actor(batch.obs)).mean()
+            loss.backward()
+            optimisers[0].step()
+            tools.soft_update(slow_actor, actor, 0.1)
+            tools.soft_update(slow_critic, critic, 0.1)
+        wasted = any(p.grad is not None for p in slow_critic.parameters())
+        return torch.cat([learning.flat(n) for n in (actor, critic, slow_actor, slow_critic)]), wasted
+
+    right, wasted = outline(detach=True, freeze=True)
+    assert not wasted
+    for detach, freeze in ((False, True), (True, False), (False, False)):
+        same, wasted = outline(detach, freeze)
+        assert torch.equal(same, right) and wasted is not detach  # the same numbers, for more work
+
+
+def test_the_two_bugs_of_the_figure_do_what_the_text_says() -> None:
+    problem = tools.CART
+    rng = np.random.default_rng(0)
+
+    def gain(ends: float, inverted: bool = False) -> float:
+        agent = tools.Agent(tools.LinearActor([[0.0]]), tools.QuadraticCritic(np.eye(2)), 0.9, 0.1, 1e-2, 3e-2)
+        for _ in range(800):
+            batch = problem.batch(rng, 64)
+            flags = torch.from_numpy((rng.random(64) < ends).astype(np.float32))
+            agent.update(batch._replace(terminated=1 - flags if inverted else flags))
+        return float(agent.actor.gain.detach())
+
+    exact = float(problem.gain[0, 0])
+    assert gain(0.0) == pytest.approx(exact, abs=0.06)
+    assert abs(gain(0.0, inverted=True)) < 0.05
+    assert 0.2 < gain(0.2) < exact - 0.1
+
+
+def test_simulation_is_judged_as_the_training_task_is(handed_in: Path) -> None:
+    from robotbrain.rl.gap_variants import reach_cfg
+    from robotbrain.rl.onnx_policy import OnnxPolicy
+    from robotbrain.rl.tasks.reach import ReachEvaluation
+
+    trained = OnnxPolicy(handed_in / "reach_policy.onnx")
+    in_task = ReachEvaluation(reach_cfg(), episodes=60, num_threads=1)(trained)
+    judged = policy.episodes(trained, range(60), 3, nominal=True)
+    assert in_task["success"] > 0.95 and judged.success.mean() > 0.95
+    assert judged.final_error.mean() == pytest.approx(in_task["error_m"], abs=0.003)
+
+
+def test_the_gap_is_there_and_randomisation_closes_it(handed_in: Path) -> None:
+    from robotbrain.rl.onnx_policy import OnnxPolicy
+
+    serials = range(500, 560)
+    outcomes = {
+        name: policy.episodes(OnnxPolicy(handed_in / f"{name}.onnx"), serials, 4, nominal=False).success.tolist()
+        for name in ("reach_policy", "reach_policy_robust")
+    }
+    _, low, _ = evidence.newcombe(outcomes["reach_policy_robust"], outcomes["reach_policy"])
+    assert low > 0.2
+    assert evidence.exact_bound(sum(outcomes["reach_policy_robust"]), 60) > policy.SURROGATE_BOUND
+
+
+# ---------------------------------------------------------------- the class
+
+
+@pytest.fixture(scope="module")
+def graded(repo: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[ClassResult, dict]:
+    out = tmp_path_factory.mktemp("class")
+    course = find_course(repo)
+    manifest = make_class(course, LAB, out / "class")
+    seen = set()
+    for student, entry in list(manifest.items()):
+        # Here a mutant of each third exercise, one style and the stub; `make mutation-test` grades all.
+        exercise = entry.get("exercise")
+        keep = entry["kind"] in ("reference", "stub") or entry["name"] == "lists"
+        if entry["kind"] == "mutant" and exercise not in seen:
+            keep = len(seen) % 3 == 1
+            seen.add(exercise)
+        if not keep:
+            shutil.rmtree(out / "class" / student)
+            del manifest[student]
+    return grade_class(course, LAB, submitted=out / "class", out=out / "graded", workers=graders()), manifest
+
+
+@pytest.mark.timeout(1200)
+def test_every_mutant_loses_its_own_points_only_and_every_style_gets_all(graded: tuple[ClassResult, dict]) -> None:
+    result, manifest = graded
+    rows = mutation.judge(result.to_dict(), manifest)
+    assert len(rows) == len(manifest) >= 7
+    assert not [row for row in rows if row.problems], mutation.table(rows)
+
+
+def test_every_submission_ends_in_a_grade_and_a_feedback_page(graded: tuple[ClassResult, dict]) -> None:
+    result, manifest = graded
+    assert {row.student for row in result.rows} == set(manifest)
+    for row in result.rows:
+        pages = list((result.feedback / row.student / LAB).glob("*.html"))
+        assert len(pages) == 1, row.student
+        if row.verdict != "full":
+            assert row.reason(), row.student
+
+
+def test_hidden_tests_do_not_show_in_feedback(graded: tuple[ClassResult, dict]) -> None:
+    result, _ = graded
+    for row in result.rows:
+        page = next((result.feedback / row.student / LAB).glob("*.html")).read_text(encoding="utf-8")
+        for secret in ("student.rng", "compare_fixed_point", "judge(", "autograder/hidden"):
+            assert secret not in page, f"{row.student}: {secret}"
