@@ -32,7 +32,7 @@ def path(repo: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def executed(path: Path) -> Any:
-    return lessons.execute(path, CLAIMS)
+    return lessons.execute(path, CLAIMS, timeout=300)
 
 
 def test_the_form_of_a_lesson(path: Path) -> None:

@@ -45,7 +45,7 @@ def test_it_runs_from_the_top_and_says_nothing_on_stderr(executed: Any) -> None:
 
 
 def test_every_figure_and_table_can_be_read_by_everybody(executed: Any) -> None:
-    lessons.check_readable(executed, figures=4, tables=2)
+    lessons.check_readable(executed, figures=3, tables=1)
 
 
 def test_open_exercises_are_reported_kindly(executed: Any) -> None:

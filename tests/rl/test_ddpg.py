@@ -147,8 +147,9 @@ def random_batch(seed, n=32, obs_dim=4, act_dim=2):
     return Batch(*draw)
 
 
-def test_update_agrees_with_a_plain_implementation():
-    config = DDPGConfig(hidden=(16, 16), gamma=0.9, tau=0.1, actor_lr=1e-2, critic_lr=3e-2)
+@pytest.mark.parametrize("every", [1, 2])
+def test_update_agrees_with_a_plain_implementation(every):
+    config = DDPGConfig(hidden=(16, 16), gamma=0.9, tau=0.1, actor_lr=1e-2, critic_lr=3e-2, actor_every=every)
     agent = DDPG(4, 2, config, seed=3)
     nets = [
         {k: v.detach().clone().requires_grad_() for k, v in m.named_parameters()} for m in (agent.actor, agent.critic)
@@ -165,15 +166,17 @@ def test_update_agrees_with_a_plain_implementation():
         optimisers[1].zero_grad()
         q_loss.backward()
         optimisers[1].step()
-        pi_loss = -call(agent.critic, nets[1], (b.obs, call(agent.actor, nets[0], b.obs))).mean()
-        optimisers[0].zero_grad()
-        pi_loss.backward()
-        optimisers[0].step()
+        if (seed + 1) % every == 0:
+            pi_loss = -call(agent.critic, nets[1], (b.obs, call(agent.actor, nets[0], b.obs))).mean()
+            optimisers[0].zero_grad()
+            pi_loss.backward()
+            optimisers[0].step()
         for lagging, net in zip(slow, nets, strict=True):
             for name in net:
                 lagging[name] = 0.9 * lagging[name] + 0.1 * net[name].detach()
         assert losses.critic == pytest.approx(q_loss.item(), rel=1e-4)
-        assert losses.actor == pytest.approx(pi_loss.item(), rel=1e-4, abs=1e-6)
+        if seed + 1 >= every:
+            assert losses.actor == pytest.approx(pi_loss.item(), rel=1e-4, abs=1e-6)
     ours = (agent.actor, agent.critic, agent.actor_target, agent.critic_target)
     for module, plain in zip(ours, (*nets, *slow), strict=True):
         for name, value in module.named_parameters():
@@ -397,7 +400,7 @@ def uninterrupted():
 
 
 def interrupted_config(overlap):
-    return dataclasses.replace(SMALL, total_steps=400, overlap=overlap, noise="ou", eval_every=8)
+    return dataclasses.replace(SMALL, total_steps=400, overlap=overlap, noise="ou", actor_every=3, eval_every=8)
 
 
 @pytest.mark.parametrize(("overlap", "stop_after"), [(False, 80), (False, 304), (True, 160), (True, 304)])

@@ -71,6 +71,16 @@ def test_exactly_so_many_episodes_and_the_same_again() -> None:
     assert np.array_equal(table.lengths, again.lengths) and not np.array_equal(table.lengths, other.lengths)
 
 
+def test_an_episode_without_an_end_is_told() -> None:
+    class Endless(PointEnv):
+        def step(self, action: torch.Tensor) -> tuple[Any, ...]:
+            none = torch.zeros(self.num_envs, dtype=torch.bool)
+            return self._obs(), torch.ones(self.num_envs), none, none, {}
+
+    with pytest.raises(InputError, match=r"31 control steps without an end(.|\n)*within 3 steps"):
+        run_episodes(Endless(2, limit=3), nothing, 2)
+
+
 def test_measures_are_of_the_episode_that_ended() -> None:
     table = run_episodes(HalfFails(6), nothing, 30, measure=clock, tail=3)
     long = ~table.terminated

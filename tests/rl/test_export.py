@@ -16,9 +16,10 @@ from hypothesis import strategies as st
 from onnx import TensorProto, helper, numpy_helper
 from torch import nn
 
+import robotbrain.rl
 from robotbrain.errors import InputError, RobotBrainError
 from robotbrain.rl.export import OPSET, OnnxPolicy, PolicyMeta, export_policy, policy_bytes
-from robotbrain.rl.onnx_policy import MAX_BYTES
+from robotbrain.rl.onnx_policy import MAX_BYTES, checked_model
 
 META = PolicyMeta(
     "reach",
@@ -250,6 +251,74 @@ class TestStrangers:
         weights = {"first": np.zeros((5, 1500), np.float32), "square": square, "last": np.zeros((1500, 2), np.float32)}
         with pytest.raises(InputError, match="operations"):
             OnnxPolicy(graph_file(tmp_path, nodes, weights))
+
+    @pytest.mark.parametrize("count", [2, 30])
+    def test_many_results_of_medium_size_are_too_much_memory_together(self, tmp_path: Path, count: int) -> None:
+        weights = {"w": np.ones((5, 2)), "tall": np.ones((2000, 1)), "wide": np.ones((1, 2000))}
+        nodes = [
+            helper.make_node("Cast", ["obs"], ["x"], to=TensorProto.DOUBLE),
+            helper.make_node("ReduceMax", ["x"], ["one"], keepdims=1),
+            helper.make_node("Mul", ["tall", "one"], ["column"]),
+            *(helper.make_node("Mul", ["column", "wide"], [f"big{i}"]) for i in range(count)),  # 32 MB each
+            helper.make_node("Max", [f"big{i}" for i in range(count)], ["all"]),
+            helper.make_node("ReduceMax", ["all"], ["top"], keepdims=1),
+            helper.make_node("MatMul", ["x", "w"], ["y"]),
+            helper.make_node("Add", ["y", "top"], ["z"]),
+            helper.make_node("Cast", ["z"], ["actions"], to=TensorProto.FLOAT),
+        ]
+        data = graph_file(tmp_path, nodes, weights).read_bytes()
+        assert len(data) < 50_000
+        if count == 2:
+            checked_model(data)
+            return
+        with pytest.raises(InputError, match="numbers in all nodes' outputs"):
+            checked_model(data)
+
+    def test_slow_functions_repeated_reading_and_single_rows_are_work(self, tmp_path: Path) -> None:
+        weights = {"many": np.zeros((5, 100_000), np.float32), "last": np.zeros((100_000, 2), np.float32)}
+
+        def chain(op: str) -> Path:
+            nodes = [helper.make_node("MatMul", ["obs", "many"], ["h0"])]
+            nodes += [helper.make_node(op, [f"h{i}"], [f"h{i + 1}"]) for i in range(14)]
+            nodes.append(helper.make_node("MatMul", ["h14", "last"], ["actions"]))
+            return graph_file(tmp_path, nodes, weights, input=[1, 5], output=[1, 2])
+
+        checked_model(chain("Relu").read_bytes())
+        with pytest.raises(InputError, match="operations"):
+            checked_model(chain("Erf").read_bytes())
+
+        def reading(times: int, batch: object) -> bytes:
+            weights = {**W, "much": np.zeros((1, 1_000_000), np.float32)}
+            nodes = [helper.make_node("MatMul", ["obs", "w"], ["y0"])]
+            for i in range(times):
+                nodes.append(helper.make_node("ReduceMax", ["much"], [f"top{i}"], axes=[1], keepdims=1))
+                nodes.append(
+                    helper.make_node("Add", [f"y{i}", f"top{i}"], [f"y{i + 1}" if i + 1 < times else "actions"])
+                )
+            return graph_file(tmp_path, nodes, weights, input=[batch, 5], output=[batch, 2]).read_bytes()
+
+        checked_model(reading(20, "batch"))
+        with pytest.raises(InputError, match="operations"):
+            checked_model(reading(20, 1))  # is run 64 times for 64 observations
+
+    def test_a_full_dense_network_and_the_shipped_policies_are_within_the_limits(self, tmp_path: Path) -> None:
+        wide = 1995  # 16 MB of weights
+        weights = {
+            "a": np.zeros((5, wide), np.float32),
+            "b": np.zeros((wide, wide), np.float32),
+            "c": np.zeros((wide, 2), np.float32),
+        }
+        ends = ["obs", "h", "e", "g", "actions"]
+        steps = zip(("MatMul", "Elu", "MatMul"), ends, ends[1:], strict=False)
+        nodes = [helper.make_node(op, [x, *{"obs": "a", "e": "b"}.get(x, "")], [y]) for op, x, y in steps]
+        nodes.append(helper.make_node("MatMul", ["g", "c"], ["actions"]))
+        data = graph_file(tmp_path, nodes, weights).read_bytes()
+        assert 0.95 * MAX_BYTES < len(data) < MAX_BYTES
+        checked_model(data)
+        shipped = sorted((Path(robotbrain.rl.__file__).parent / "weights").glob("*.onnx"))
+        assert shipped
+        for path in shipped:
+            OnnxPolicy(path)
 
     def test_integer_division_is_refused(self, tmp_path: Path) -> None:
         nodes = [

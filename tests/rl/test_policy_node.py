@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 import robotbrain.ros  # noqa: F401 - makes rclpy and the messages importable
 from robotbrain.errors import InputError
-from robotbrain.rl.deployment import NodeOptions, PolicyRunner, joint_order
+from robotbrain.rl.deployment import NodeOptions, PolicyRunner, joint_order, reach_bound
 from robotbrain.rl.policy_meta import PolicyMeta
 from robotbrain.rl.surrogate import Surrogate, SurrogateFleet, SurrogateReachEnv, neutral
 from robotbrain.rl.surrogate.body import Kinematics, load_body
@@ -65,7 +65,7 @@ def context() -> Iterator[SimContext]:
 class Bench:
     """A node with its topics in the test's hands."""
 
-    def __init__(self, context: SimContext, policy: Any, **options: Any) -> None:
+    def __init__(self, context: SimContext, policy: Any, hand: Any = None, **options: Any) -> None:
         from geometry_msgs.msg import PoseStamped
         from rclpy.node import Node
         from rclpy.qos import qos_profile_sensor_data
@@ -76,7 +76,7 @@ class Bench:
 
         self.context, self.sent = context, []
         order = joint_order(policy.meta.joint_names, ARM.joint_names)
-        self.node = PolicyNode(policy, ARM.limits[order], options=NodeOptions(**options))
+        self.node = PolicyNode(policy, ARM.limits[order], hand, options=NodeOptions(**options))
         hands = Node("hands")
         self.states = hands.create_publisher(JointState, "joint_states", qos_profile_sensor_data)
         self.goals = hands.create_publisher(PoseStamped, "goal_pose", 1)
@@ -91,11 +91,17 @@ class Bench:
         msg.header.frame_id, msg.pose.position.x, msg.pose.orientation.w = frame, x, 1.0
         self.goals.publish(msg)
 
-    def state(self, position: ArrayLike, names: Any = ARM.joint_names, velocity: ArrayLike | None = None) -> None:
+    def state(
+        self,
+        position: ArrayLike,
+        names: Any = ARM.joint_names,
+        velocity: ArrayLike | None = None,
+        stamp_ns: int | None = None,
+    ) -> None:
         from robotbrain.ros.conversions import ns_to_time
 
         msg = self.state_type()
-        msg.header.stamp, msg.name = ns_to_time(self.context.now_ns), list(names)
+        msg.header.stamp, msg.name = ns_to_time(self.context.now_ns if stamp_ns is None else stamp_ns), list(names)
         msg.position = [float(v) for v in np.asarray(position)]
         msg.velocity = [float(v) for v in (np.zeros(len(msg.name)) if velocity is None else np.asarray(velocity))]
         self.states.publish(msg)
@@ -194,7 +200,94 @@ def test_values_that_are_not_finite_are_no_joint_states(context: SimContext) -> 
     assert bench.node.refused > 0
 
 
-def test_missing_velocities_are_differentiated(context: SimContext) -> None:
+@pytest.mark.parametrize("stamp_s", [100.0, 1e6])
+def test_a_clock_that_was_set_back_silences_the_node_only_until_the_last_state_is_stale(
+    context: SimContext, stamp_s: float
+) -> None:
+    bench = Bench(context, ServoPolicy(), stale_s=0.15)
+    bench.goal()
+    bench.run(0.5, lambda: bench.state(ARM.default_joint_pos))
+    bench.state(ARM.default_joint_pos, stamp_ns=round(stamp_s * 1e9))  # of the future: obeyed, as of another clock
+    bench.run(1.0, lambda: bench.state(ARM.default_joint_pos))
+    assert 13 <= bench.node.refused <= 17  # in 0.15 s, one every 10 ms
+    assert [t for t, _ in bench.sent][-1] > context.now_ns - 50_000_000
+    assert bench.node.stale_periods <= 1
+
+
+def test_overtaken_states_are_refused_and_copies_are_not_counted(context: SimContext) -> None:
+    policy = ServoPolicy()
+    bench = Bench(context, policy)
+    bench.goal()
+
+    def feed() -> None:
+        bench.state(ARM.default_joint_pos)
+        bench.state(ARM.default_joint_pos)
+        bench.state(ARM.default_joint_pos + 0.3, stamp_ns=max(1, context.now_ns - 5_000_000))
+
+    context.run_until(100_000_000)
+    bench.run(0.2, feed)
+    assert bench.node.refused == 20
+    np.testing.assert_allclose([row[:7] for row in policy.seen], 0.0, atol=1e-6)
+
+
+def test_a_stamp_that_stands_still_is_told(context: SimContext) -> None:
+    bench = Bench(context, ServoPolicy(), stale_s=0.15)
+    bench.goal()
+    bench.run(0.5, lambda: bench.state(ARM.default_joint_pos, stamp_ns=7))
+    assert bench.node.stale_periods == 1
+    assert bench.node.refused > 20
+
+
+def test_goals_out_of_reach_are_refused_and_the_last_one_stays(context: SimContext) -> None:
+    policy = ServoPolicy()
+    bench = Bench(context, policy, hand=Kinematics(ARM))
+    bench.goal(x=0.5)
+    bench.run(0.2, lambda: bench.state(ARM.default_joint_pos))
+    bench.goal(x=50.0)
+    bench.run(0.2, lambda: bench.state(ARM.default_joint_pos))
+    assert bench.node.refused == 1
+    assert policy.seen[-1][14] == 0.5
+
+
+def test_the_reach_bound_is_that_of_a_straight_arm() -> None:
+    def hand(q: NDArray[np.float64]) -> NDArray[np.float64]:
+        angle = np.cumsum(q, axis=1)
+        return np.stack([np.cos(angle) @ [0.5, 0.3, 0.2], np.sin(angle) @ [0.5, 0.3, 0.2], np.zeros(len(q))], axis=1)
+
+    free = np.array([[-np.inf, np.inf]] * 3)
+    assert reach_bound(hand, free) == pytest.approx(1.05, rel=0.01)
+    bent = np.array([[-3.0, 3.0], [1.0, 2.0], [0.0, 1e-9]])  # straight forearm, elbow at 1 rad at least
+    expected = np.sqrt(0.5**2 + 0.5**2 + 2 * 0.5 * 0.5 * np.cos(1.0))
+    assert reach_bound(hand, bent) == pytest.approx(1.05 * expected, rel=0.01)
+
+
+def test_readings_far_outside_the_limits_are_refused_with_the_joints_name(
+    context: SimContext, capfd: pytest.CaptureFixture[str]
+) -> None:
+    bench = Bench(context, ServoPolicy([6, 5, 4, 3, 2, 1, 0]))
+    bench.goal()
+    position = ARM.default_joint_pos.copy()
+    position[3] = ARM.limits[3, 0] - 0.4
+    bench.run(0.1, lambda: bench.state(position))
+    assert bench.node.refused == 0
+    count = bench.node.commands
+    assert count > 0
+    position[3] = np.rad2deg(1.6)
+    bench.run(0.1, lambda: bench.state(position))
+    assert bench.node.refused == 10
+    assert "angle of joint4" in "".join(capfd.readouterr())
+
+
+def test_the_last_action_is_observed_as_it_was_used() -> None:
+    policy = ServoPolicy(goal=GOAL + 100.0)
+    runner = PolicyRunner(policy, ARM.limits)
+    for _ in range(2):
+        runner.act(ARM.default_joint_pos[None], np.zeros((1, 7)), np.zeros((1, 3)))
+    np.testing.assert_array_equal(policy.seen[1][17:], 1.0)  # not some 300
+
+
+@pytest.mark.parametrize("stamped", [True, False])
+def test_missing_velocities_are_differentiated(context: SimContext, stamped: bool) -> None:
     policy = ServoPolicy()
     bench = Bench(context, policy)
     bench.goal()
@@ -203,7 +296,7 @@ def test_missing_velocities_are_differentiated(context: SimContext) -> None:
         from robotbrain.ros.conversions import ns_to_time
 
         msg = bench.state_type()
-        msg.header.stamp, msg.name = ns_to_time(context.now_ns), list(ARM.joint_names)
+        msg.header.stamp, msg.name = ns_to_time(context.now_ns if stamped else 0), list(ARM.joint_names)
         msg.position = [float(v) for v in ARM.default_joint_pos + 0.5 * context.now_ns * 1e-9]
         bench.states.publish(msg)
 

@@ -107,6 +107,28 @@ def test_settings_in_a_strangers_file_are_texts(changed: Any, trained: Path, tmp
         load_policy(tmp_path / "wrong.onnx")
 
 
+def test_settings_in_a_strangers_file_are_not_obeyed(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert rl("export", trained, "--out", tmp_path / "right.onnx") == 0
+    module = load_policy(trained).module
+    assert module is not None
+    endless = ["env.episode_length_s=0.02", "env.terminations=null", "\x1b[2J"]
+    wrong = dataclasses.replace(OnnxPolicy(tmp_path / "right.onnx").meta, provenance={"set": endless})
+    export_policy(module, tmp_path / "wrong.onnx", wrong)
+    assert load_policy(tmp_path / "wrong.onnx").command == {"task": "reach", "set": []}
+    assert rl("evaluate", tmp_path / "wrong.onnx", "--episodes", "2", "--threads", "1") == 0
+    out = capsys.readouterr().out
+    assert "not taken over from the file: 'env.episode_length_s=0.02, env.terminations=null" in out
+    assert "\x1b" not in out
+
+
+def test_a_folder_is_no_policy_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert rl("gap", tmp_path) == 2
+    err = capsys.readouterr().err
+    assert "(a folder)" in err and "robotbrain rl export" in err
+
+
 @pytest.mark.parametrize("task", ["reach", "velocity", "navigation"])
 def test_every_task_goes_on_exactly_from_a_file(task: str, tmp_path: Path) -> None:
     """Through a checkpoint, where equal numbers are other objects, into an environment with another past."""

@@ -95,13 +95,17 @@ class BodyVelocityActionCfg(ActionTermCfg):
 def obstacle_rectangles(env: ManagerBasedRLEnv, env_ids: Any = None) -> Tensor:
     """The layouts that stand in the simulations now, (n, K, 5): see :mod:`robotbrain.rl.tasks.layouts`."""
     world = env.scene.world
-    rows = slice(None) if env_ids is None else torch.as_tensor(env_ids).numpy()
-    first, count = _obstacle_geoms(env)
-    place = torch.from_numpy(world.batch.mocap_pos[rows, :, :2]).float()
-    turn = torch.from_numpy(world.batch.mocap_quat[rows]).float()
-    yaw = 2.0 * torch.atan2(turn[..., 3], turn[..., 0])
-    half = torch.from_numpy(world.expand("geom_size")[rows, first : first + count, :2]).float()
-    return torch.cat((place, yaw[..., None], half), -1)
+
+    def compute(rows: Any) -> Tensor:
+        first, count = _obstacle_geoms(env)
+        place = torch.from_numpy(world.batch.mocap_pos[rows, :, :2]).float()
+        turn = torch.from_numpy(world.batch.mocap_quat[rows]).float()
+        yaw = 2.0 * torch.atan2(turn[..., 3], turn[..., 0])
+        half = torch.from_numpy(world.expand("geom_size")[rows, first : first + count, :2]).float()
+        return torch.cat((place, yaw[..., None], half), -1)
+
+    every = env.scene.until_written("obstacle_rectangles", compute)
+    return every if env_ids is None else every[torch.as_tensor(env_ids)]
 
 
 def obstacle_clearance(env: ManagerBasedRLEnv, room_half: float = 4.0) -> Tensor:

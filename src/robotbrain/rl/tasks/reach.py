@@ -180,6 +180,7 @@ def reach_ddpg_config(**changes: object) -> DDPGConfig:
         "tau": 0.02,
         "actor_lr": 2e-3,
         "critic_lr": 2e-3,
+        "actor_every": 2,  # as in TD3: a quarter less work per update, and no more updates
         "noise_std": 0.2,
         "averaged": True,  # such rates are quick, but the actor itself misses the last centimetre every other moment
         "overlap": True,
