@@ -5,10 +5,12 @@ reward, discount, exploration noise, network (256-256) and one PyTorch thread; t
 not. Each finished run is one JSON file in DIR, so it can be stopped at any time and started again; ``--table`` only
 prints what is there. A run that is not done after ``--cap`` seconds of training counts as "at least" that long.
 
-Stable-Baselines3 runs with its defaults otherwise: with 16 environments and 4 updates per step of all of them, with
-the same and the kit's learning rates, target rate and batch size, and with one environment as it comes. Every learner
-is judged after each 100 updates: on 100 targets, and where it reaches 90 of them on the 500 that count. A policy that
-passes is tried on 500 more, for the record. Needs ``pip install stable-baselines3``.
+The kit updates its actor after every second update of its critic and is judged by the average of its latest actors
+(``actor_every``, ``averaged``). Stable-Baselines3's DDPG has neither, and runs with its defaults otherwise: with 16
+environments and 4 updates per step of all of them, with the same and the kit's learning rates, target rate and batch
+size, and with one environment as it comes. Every learner is judged after each 100 updates: on 100 targets, and where it
+reaches 90 of them on the 500 that count. A policy that passes is tried on 500 more, for the record. Needs
+``pip install stable-baselines3``.
 """
 
 from __future__ import annotations

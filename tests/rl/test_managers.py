@@ -124,6 +124,28 @@ def test_history_is_oldest_first_and_filled_by_the_first_sample() -> None:
     assert by_time.step(torch.zeros(4, 2))[0]["policy"][0].tolist() == [1, 1, -1, 2, 1, -1]
 
 
+def test_the_final_observation_has_the_last_sample_in_its_history_and_disturbs_nobodys() -> None:
+    def run(**fields: Any) -> tuple[list[list[float]], list[list[float]]]:
+        env = make(
+            observations=group({"history_length": 3}, c=ObservationTermCfg(func=counter)),
+            episode_length_s=0.1,
+            **fields,
+        )
+        seen, final = [], []
+        for step in range(12):
+            if step == 2:
+                env.reset(env_ids=[0])  # from here on environment 0 ends at other times than the rest
+            obs, *_, extras = env.step(torch.zeros(4, 2))
+            seen.append(obs["policy"].flatten().tolist())
+            if "final_obs" in extras:
+                final.append(extras["final_obs"]["policy"][int(len(final) % 2 == 0)].tolist())
+        return seen, final
+
+    seen, final = run(compute_final_obs=True)
+    assert seen == run()[0]
+    assert final == [[13, 14, 15], [3, 4, 5], [13, 14, 15], [3, 4, 5]]
+
+
 def test_a_constant_delay_shows_old_samples_of_this_episode_only() -> None:
     late = ObservationTermCfg(func=counter, delay_min_lag=2, delay_max_lag=2)
     env = make(observations=group(None, late=late), episode_length_s=0.1)

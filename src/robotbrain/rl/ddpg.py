@@ -123,6 +123,7 @@ class DDPGConfig:
     tau: float = 0.005  #: how fast the target networks follow
     actor_lr: float = 1e-4  #: Adam's step size
     critic_lr: float = 1e-3
+    actor_every: int = 1  #: updates of the critic for one of the actor; the paper has 1, TD3 (2018) 2, which is cheaper
     hidden: tuple[int, ...] = (256, 256)  #: hidden layers of actor and critic
     noise: str = "gaussian"  #: exploration: "gaussian" or "ou"
     noise_std: float = 0.1  #: standard deviation ("ou": sigma), actions being in [-1, 1]
@@ -137,7 +138,7 @@ class DDPGConfig:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "hidden", tuple(int(width) for width in self.hidden))
-        for name in ("total_steps", "batch_size", "buffer_size", "eval_every", "checkpoint_every"):
+        for name in ("total_steps", "batch_size", "buffer_size", "actor_every", "eval_every", "checkpoint_every"):
             self._require(name, getattr(self, name) >= 1, "at least 1")
         for name in ("actor_lr", "critic_lr", "updates_per_step", "noise_dt", "noise_theta"):
             self._require(name, getattr(self, name) > 0, "greater than 0")
@@ -157,7 +158,7 @@ class Losses(NamedTuple):
     """What one update saw."""
 
     critic: float  #: mean squared error of the critic, before the step
-    actor: float  #: minus the mean value of the actor's actions
+    actor: float  #: minus the mean value of the actor's actions, when it was last updated
 
 
 class DDPG:
@@ -184,6 +185,7 @@ class DDPG:
         self.actor_optimizer = torch.optim.Adam(self.actor.parameters(), lr=config.actor_lr, fused=True)
         self.critic_optimizer = torch.optim.Adam(self.critic.parameters(), lr=config.critic_lr, fused=True)
         self.generator = torch.Generator().manual_seed(seeds[1])  # draws batches and warm-up actions
+        self.updates, self._actor_loss = 0, math.nan
         explorer = torch.Generator().manual_seed(seeds[2])
         self.noise = (
             OrnsteinUhlenbeckNoise(act_dim, config.noise_std, config.noise_theta, config.noise_dt, explorer)
@@ -226,28 +228,33 @@ class DDPG:
         self.critic_optimizer.zero_grad()
         torch.autograd.backward(q_loss)
         self.critic_optimizer.step()
+        self.updates += 1
 
-        pi_loss = actor_loss(self.actor, self.critic, batch.obs)
-        self.actor_optimizer.zero_grad()
-        # Only the actor's gradients: those of the critic's weights would be a quarter of the work, and thrown away.
-        torch.autograd.backward(pi_loss, inputs=list(self.actor.parameters()))
-        self.actor_optimizer.step()
+        if self.updates % self.config.actor_every == 0:
+            pi_loss = actor_loss(self.actor, self.critic, batch.obs)
+            self.actor_optimizer.zero_grad()
+            # Only the actor's gradients: those of the critic's weights would be a quarter of the work, and thrown away.
+            torch.autograd.backward(pi_loss, inputs=list(self.actor.parameters()))
+            self.actor_optimizer.step()
+            self._actor_loss = pi_loss.item()
 
         soft_update(self.critic_target, self.critic, self.config.tau)
         soft_update(self.actor_target, self.actor, self.config.tau)
-        return Losses(q_loss.item(), pi_loss.item())
+        return Losses(q_loss.item(), self._actor_loss)
 
     _PARTS = ("actor", "critic", "actor_target", "critic_target", "actor_optimizer", "critic_optimizer", "noise")
 
     def state_dict(self) -> dict[str, Any]:
         """Weights, optimisers and generators: all that later actions and updates depend on."""
         state = {name: getattr(self, name).state_dict() for name in self._PARTS}
+        state |= {"updates": self.updates, "actor_loss": self._actor_loss}
         return state | {"generator": self.generator.get_state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go back to a state that `state_dict` returned."""
         for name in self._PARTS:
             getattr(self, name).load_state_dict(state[name])
+        self.updates, self._actor_loss = state["updates"], state["actor_loss"]
         self.generator.set_state(state["generator"])
 
 
@@ -448,7 +455,7 @@ class Trainer:
 
     def record(self, evaluate: Callable[[Policy], dict[str, float]] | None) -> Record:
         """Add a point to the learning curve and return it."""
-        if self.updates and not all(map(math.isfinite, self.losses)):
+        if self.updates >= self.config.actor_every and not all(map(math.isfinite, self.losses)):
             raise RobotBrainError(
                 f"The training diverged: the losses are {self.losses} after {self.updates} updates. Use smaller "
                 "learning rates, or scale rewards and observations to about 1; the last checkpoint is unharmed."

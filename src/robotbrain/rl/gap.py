@@ -43,7 +43,9 @@ RECIPE: dict[str, Any] = {
     "tau": 0.01,
     "actor_lr": 1e-3,
     "critic_lr": 1e-3,
+    "actor_every": 1,
     "noise_std": 0.1,
+    "averaged": False,
 }
 """What the study's trainings have other than the quick recipe of the reach task: smaller steps, and more of them."""
 
@@ -252,14 +254,6 @@ def gap_main(arguments: argparse.Namespace) -> int:
     if arguments.policies:
         from robotbrain.rl.onnx_policy import OnnxPolicy
 
-        for path in arguments.policies:
-            if path.is_dir():
-                raise InputError(
-                    "policy",
-                    given=f"{path} (a folder)",
-                    expected="an ONNX file",
-                    fix=f"Of a run: robotbrain rl export {path}; then robotbrain rl gap {path / 'policy.onnx'}.",
-                )
         rows = {path.stem: {0: measure(OnnxPolicy(path), episodes=arguments.episodes)} for path in arguments.policies}
         report = GapReport(rows, {"serials": list(SERIALS), "episodes": arguments.episodes})
     elif arguments.train is not None:

@@ -145,6 +145,9 @@ def read_limited(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
     Raises:
         InputError: for anything else.
     """
+    if path.is_dir():
+        fix = f"Of a training run: `robotbrain rl export {path}` writes it, as {path / 'policy.onnx'}."
+        raise _refuse("policy", f"{path} (a folder)", "an ONNX file", fix)
     try:
         # Without O_NONBLOCK, opening a pipe would wait for its writer for ever.
         handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))

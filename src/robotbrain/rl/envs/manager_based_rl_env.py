@@ -205,7 +205,7 @@ class ManagerBasedRLEnv:
         signals = reward, terminations.terminated, terminations.time_outs
         if ended.any().item():
             if self.cfg.compute_final_obs:
-                self.extras["final_obs"] = self.observation_manager.compute()
+                self.extras["final_obs"] = self.observation_manager.peek()
             self._reset_idx(ended.nonzero().flatten())
             self.extras["log"]["Episode_Termination/non_finite_state"] = self.non_finite_count
         self.command_manager.compute(self.step_dt)

@@ -87,6 +87,18 @@ class ObservationManager(ManagerBase):
         """All groups; only with ``update_history`` delays and histories take the present sample in."""
         return {name: self.compute_group(name, update_history) for name in self._groups}
 
+    def peek(self) -> dict[str, Observation]:
+        """All groups as a step would return them, the present sample taken in, and nothing remembered of it.
+
+        The last observation of an episode: with a delay or a history :meth:`compute` alone returns the previous step's.
+        """
+        if not any(group.has_memory for group in self._groups.values()):
+            return self.compute()
+        kept = self.state_dict()
+        seen = self.compute(update_history=True)
+        self.load_state_dict(kept)
+        return seen
+
     def compute_group(self, group_name: str, update_history: bool = False) -> Observation:
         """One group: (num_envs, dim), or a dictionary where it is not concatenated; new tensors each time.
 
@@ -163,7 +175,7 @@ class _Group:
                 term.func.reset()
         self._dim = cfg.concatenate_dim + 1 if cfg.concatenate_dim >= 0 else cfg.concatenate_dim
         self.shape = self._joint_shape()
-        simple = cfg.concatenate_terms and not self._has_memory() and all(len(s) == 1 for s in raw_shapes.values())
+        simple = cfg.concatenate_terms and not self.has_memory and all(len(s) == 1 for s in raw_shapes.values())
         self._fused = _Fused(terms, raw_shapes) if simple else None
 
     def reset(self, env_ids: torch.Tensor | None) -> None:
@@ -222,7 +234,9 @@ class _Group:
             )
         term.scale = scale  # type: ignore[assignment]
 
-    def _has_memory(self) -> bool:
+    @property
+    def has_memory(self) -> bool:
+        """Whether a term of the group has a delay or a history."""
         return bool(self.delays or self.histories)
 
     def _time_major(self) -> bool:

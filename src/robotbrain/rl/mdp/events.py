@@ -96,7 +96,12 @@ def _reset_joints(
     columns = joints if isinstance(joints, slice) else joints.numpy()
     position, velocity, limits, speed = (
         view.torch.numpy()[rows][:, columns]  # in numpy: fewer microseconds for the few rows of a reset
-        for view in (data.default_joint_pos, data.default_joint_vel, data.soft_joint_pos_limits, data.soft_joint_vel_limits)
+        for view in (
+            data.default_joint_pos,
+            data.default_joint_vel,
+            data.soft_joint_pos_limits,
+            data.soft_joint_vel_limits,
+        )
     )
     position = combine(position, uniform(env, position_range, position.shape).numpy())
     velocity = combine(velocity, uniform(env, velocity_range, velocity.shape).numpy())

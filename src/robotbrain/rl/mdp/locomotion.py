@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+import numpy.typing as npt
 import torch
 
 from robotbrain.errors import InputError
@@ -19,14 +21,16 @@ if TYPE_CHECKING:
 Tensor = torch.Tensor
 
 
-def _commanded_speed(env: ManagerBasedRLEnv, command_name: str) -> Tensor:
+def _commanded_speed(env: ManagerBasedRLEnv, command_name: str) -> npt.NDArray[np.float32]:
     """Magnitude of the commanded horizontal velocity [m/s], (num_envs,)."""
-    return length(env.command_manager.get_command(command_name)[:, :2])
+    velocity = np.square(env.command_manager.get_command(command_name).numpy())
+    speed: npt.NDArray[np.float32] = np.sqrt(velocity[:, 0] + velocity[:, 1])
+    return speed
 
 
 def _wants_to_walk(env: ManagerBasedRLEnv, command_name: str) -> Tensor:
     """Where the commanded horizontal speed is above 0.1 m/s, (num_envs,) bool."""
-    return _commanded_speed(env, command_name) > 0.1
+    return torch.from_numpy(_commanded_speed(env, command_name) > 0.1)
 
 
 def feet_air_time(env: ManagerBasedRLEnv, command_name: str, sensor_cfg: SceneEntityCfg, threshold: float) -> Tensor:
@@ -34,7 +38,8 @@ def feet_air_time(env: ManagerBasedRLEnv, command_name: str, sensor_cfg: SceneEn
     sensor = contacts(env, sensor_cfg)
     landed = sensor.compute_first_contact(env.step_dt).columns(sensor_cfg.body_ids)
     air_time = sensor.data.last_air_time.columns(sensor_cfg.body_ids)
-    return ((air_time - threshold) * landed).sum(dim=1) * _wants_to_walk(env, command_name)
+    gain = torch.from_numpy((air_time.numpy() - float(threshold)) * landed.numpy()).sum(dim=1)
+    return gain.mul_(_wants_to_walk(env, command_name))
 
 
 def feet_air_time_positive_biped(
@@ -101,5 +106,5 @@ def stand_still_joint_deviation_l1(
     asset_cfg: SceneEntityCfg = SceneEntityCfg("robot"),
 ) -> Tensor:
     """:func:`joint_deviation_l1` where the commanded horizontal speed is below ``command_threshold`` [m/s], else 0."""
-    told_to_stand = _commanded_speed(env, command_name) < command_threshold
+    told_to_stand = torch.from_numpy(_commanded_speed(env, command_name) < command_threshold)
     return joint_deviation_l1(env, asset_cfg) * told_to_stand

@@ -9,18 +9,20 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 
 from robotbrain.errors import InputError
 from robotbrain.rl import math_utils
 from robotbrain.rl.managers import ManagerTermBase, SceneEntityCfg
-from robotbrain.rl.mdp._read import largest_contact, length, robot, state
+from robotbrain.rl.mdp._read import largest_contact, length, robot, squares, state
 
 if TYPE_CHECKING:
     from robotbrain.rl.envs import ManagerBasedRLEnv
     from robotbrain.rl.managers import RewardTermCfg
 
 Tensor = torch.Tensor
+_XY = slice(0, 2)
 
 
 def is_alive(env: ManagerBasedRLEnv) -> Tensor:
@@ -63,12 +65,12 @@ def lin_vel_z_l2(env: ManagerBasedRLEnv, asset_cfg: SceneEntityCfg = SceneEntity
 
 def ang_vel_xy_l2(env: ManagerBasedRLEnv, asset_cfg: SceneEntityCfg = SceneEntityCfg("robot")) -> Tensor:
     """Sum of squares of the root's roll and pitch rates in its own frame [rad2/s2]."""
-    return state(env, asset_cfg).root_ang_vel_b.torch[:, :2].square().sum(dim=1)
+    return squares(state(env, asset_cfg).root_ang_vel_b.columns(_XY))
 
 
 def flat_orientation_l2(env: ManagerBasedRLEnv, asset_cfg: SceneEntityCfg = SceneEntityCfg("robot")) -> Tensor:
     """Square of the sine of the root's tilt: the horizontal part of gravity's direction in its own frame."""
-    return state(env, asset_cfg).projected_gravity_b.torch[:, :2].square().sum(dim=1)
+    return squares(state(env, asset_cfg).projected_gravity_b.columns(_XY))
 
 
 def base_height_l2(
@@ -89,7 +91,7 @@ def base_height_l2(
             expected="None",
             fix="The kit's ground is flat: leave sensor_cfg out.",
         )
-    return torch.square(state(env, asset_cfg).root_pos_w.torch[:, 2] - target_height)
+    return torch.from_numpy(np.square(state(env, asset_cfg).root_pos_w.torch.numpy()[:, 2] - float(target_height)))
 
 
 def joint_torques_l2(env: ManagerBasedRLEnv, asset_cfg: SceneEntityCfg = SceneEntityCfg("robot")) -> Tensor:
@@ -151,7 +153,7 @@ def applied_torque_limits(env: ManagerBasedRLEnv, asset_cfg: SceneEntityCfg = Sc
 
 def action_rate_l2(env: ManagerBasedRLEnv) -> Tensor:
     """Sum of squares of the change of the action since the last step."""
-    return torch.square(env.action_manager.action - env.action_manager.prev_action).sum(dim=1)
+    return (env.action_manager.action - env.action_manager.prev_action).square_().sum(dim=1)
 
 
 def action_l2(env: ManagerBasedRLEnv) -> Tensor:
@@ -161,7 +163,8 @@ def action_l2(env: ManagerBasedRLEnv) -> Tensor:
 
 def undesired_contacts(env: ManagerBasedRLEnv, threshold: float, sensor_cfg: SceneEntityCfg) -> Tensor:
     """Number of the chosen bodies touched with more than ``threshold`` [N]."""
-    return (largest_contact(env, sensor_cfg) > threshold).sum(dim=1)
+    touched = largest_contact(env, sensor_cfg).numpy() > threshold
+    return torch.from_numpy(np.add.reduce(touched, 1, dtype=np.int64))
 
 
 def desired_contacts(env: ManagerBasedRLEnv, sensor_cfg: SceneEntityCfg, threshold: float = 1.0) -> Tensor:
@@ -178,17 +181,18 @@ def track_lin_vel_xy_exp(
     env: ManagerBasedRLEnv, std: float, command_name: str, asset_cfg: SceneEntityCfg = SceneEntityCfg("robot")
 ) -> Tensor:
     """``exp(-e^2 / std^2)`` of the error of the horizontal velocity in the root's frame [m/s]."""
-    velocity = state(env, asset_cfg).root_lin_vel_b.torch[:, :2]
-    error = torch.square(env.command_manager.get_command(command_name)[:, :2] - velocity).sum(dim=1)
-    return torch.exp(error * (-1.0 / std**2))
+    velocity = state(env, asset_cfg).root_lin_vel_b.torch.numpy()
+    error = np.square(env.command_manager.get_command(command_name).numpy()[:, :2] - velocity[:, :2])
+    return torch.from_numpy((error[:, 0] + error[:, 1]) * float(-1.0 / std**2)).exp_()
 
 
 def track_ang_vel_z_exp(
     env: ManagerBasedRLEnv, std: float, command_name: str, asset_cfg: SceneEntityCfg = SceneEntityCfg("robot")
 ) -> Tensor:
     """``exp(-e^2 / std^2)`` of the error of the yaw rate in the root's frame [rad/s]."""
-    rate = state(env, asset_cfg).root_ang_vel_b.torch[:, 2]
-    return torch.exp(-torch.square(env.command_manager.get_command(command_name)[:, 2] - rate) / std**2)
+    rate = state(env, asset_cfg).root_ang_vel_b.torch.numpy()[:, 2]
+    error = np.square(env.command_manager.get_command(command_name).numpy()[:, 2] - rate)
+    return torch.from_numpy(-error / float(std**2)).exp_()
 
 
 def position_command_error(env: ManagerBasedRLEnv, command_name: str, asset_cfg: SceneEntityCfg) -> Tensor:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 
 from robotbrain.errors import InputError
@@ -105,4 +106,5 @@ def joint_effort_out_of_limit(env: ManagerBasedRLEnv, asset_cfg: SceneEntityCfg 
 
 def illegal_contact(env: ManagerBasedRLEnv, threshold: float, sensor_cfg: SceneEntityCfg) -> Tensor:
     """One of the chosen bodies was touched with more than ``threshold`` [N]."""
-    return (largest_contact(env, sensor_cfg) > threshold).any(dim=1)
+    touched = largest_contact(env, sensor_cfg).numpy() > threshold
+    return torch.from_numpy(np.logical_or.reduce(touched, 1))

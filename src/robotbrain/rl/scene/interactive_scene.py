@@ -102,6 +102,24 @@ class InteractiveScene:
             found = self._memory[key] = (self.world.tick, compute())
         return found[1]
 
+    def until_written(self, key: Hashable, compute: Callable[[Any], torch.Tensor]) -> torch.Tensor:
+        """What ``compute(slice(None))`` returns; anew only for the environments that somebody has written to since.
+
+        For quantities that the physics does not change, e.g. where things stand. ``compute(index)`` returns the rows
+        of ``index``. Do not change the result in place.
+        """
+        found = self._memory.get(key)
+        if found is None:
+            rows = compute(slice(None))
+        else:
+            tick, rows = found
+            written = self.world.written_since(tick) if tick != self.world.tick else ()
+            if len(written):
+                rows = rows.clone()
+                rows[torch.from_numpy(written)] = compute(written)
+        self._memory[key] = (self.world.tick, rows)
+        return rows
+
     def update(self, dt: float) -> None:
         """Let the sensors take over the new state after ``dt`` seconds."""
         for sensor in self.sensors.values():

@@ -154,6 +154,10 @@ class World:
             return None
         return np.flatnonzero(self._written_tick > tick)
 
+    def written_since(self, tick: int) -> npt.NDArray[np.int64]:
+        """The environments that were written to after ``tick``, not by physics."""
+        return np.flatnonzero(self._written_tick > tick)
+
     def read_motion(self) -> torch.Tensor:
         """:attr:`motion`, up to date: one copy per state, however often it is asked for."""
         if self._motion_tick != self.tick:
