@@ -36,7 +36,7 @@ def main() -> None:
         for name, cfg in REWARDS.items():
             if str(seed) in curves[name]:
                 continue
-            recipe = reach_ddpg_config(total_steps=arguments.steps)
+            recipe = reach_ddpg_config(total_steps=arguments.steps, actor_every=1, averaged=False)  # the plain DDPG
             done = train_ddpg(lambda cfg=cfg: TaskVectorEnv(cfg()), recipe, seed=seed, evaluate=judge)
             curves[name][str(seed)] = [{k: round(point[k], 5) for k in KEPT} for point in done.curve]
             files.write_text(arguments.out, json.dumps(found, indent=1) + "\n")
