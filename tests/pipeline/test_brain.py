@@ -12,11 +12,11 @@ import pytest
 from robotbrain.errors import InputError
 from robotbrain.jetson import load_profile
 from robotbrain.pipeline.brain import GOAL_RADIUS, drive
-from robotbrain.pipeline.nodes.controller import thin_out
 from robotbrain.pipeline.nodes.mission import MissionNode
 from robotbrain.pipeline.nodes.perception import PerceptionNode
 from robotbrain.pipeline.nodes.planner import PlannerNode
 from robotbrain.pipeline.nodes.poses import StampedPoses
+from robotbrain.pipeline.nodes.sightings import thin_out
 from robotbrain.ros import CallbackError, SimContext
 from robotbrain.sim import RobotSim, generate_world, to_child
 

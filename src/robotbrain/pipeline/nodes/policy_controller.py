@@ -26,9 +26,8 @@ from robotbrain.jetson.engine import OnnxEngine
 from robotbrain.jetson.profiles import JetsonProfile, load_profile
 from robotbrain.pipeline.control import lookahead_point
 from robotbrain.pipeline.geometry import Pose, inverse, transform, wrap
-from robotbrain.pipeline.nodes.controller import thin_out
-from robotbrain.pipeline.nodes.perception import FLOOR_LABEL
-from robotbrain.pipeline.nodes.poses import FrameCheck, StampedPoses, check_finite
+from robotbrain.pipeline.nodes.poses import FrameCheck, StampedPoses, check_finite, read_plan
+from robotbrain.pipeline.nodes.sightings import Sightings
 from robotbrain.rl.onnx_policy import OnnxPolicy
 from robotbrain.rl.tasks.navigation_spec import (
     LIDAR_RANGE,
@@ -38,7 +37,6 @@ from robotbrain.rl.tasks.navigation_spec import (
     sector_ranges,
 )
 from robotbrain.ros import charge, charge_work
-from robotbrain.ros.conversions import cloud_to_points, path_to_numpy, quaternion_to_yaw, scan_to_arrays, time_to_ns
 
 
 @dataclass(frozen=True)
@@ -63,12 +61,6 @@ class PolicyControlParams:
     scan_max_age: float = 0.5
     points_max_age: float = 3.0
     points_range: float = 1.5
-
-
-@dataclass(frozen=True)
-class _Sighting:
-    stamp_ns: int
-    points: NDArray[np.float64]
 
 
 def policy_controller(
@@ -116,12 +108,17 @@ class PolicyControllerNode(Node):
         self._params = params or PolicyControlParams()
         self._frames = FrameCheck(self)
         self._poses = StampedPoses(frames=self._frames)
+        self._sightings = Sightings(
+            self._frames,
+            self._poses,
+            scan_range=LIDAR_RANGE,
+            points_range=self._params.points_range,
+            points_max_age=self._params.points_max_age,
+        )
         self._velocity = (0.0, 0.0)
         self._last_action = np.zeros(2)
         self._path: NDArray[np.float64] = np.zeros((0, 2))
         self._final_yaw: float | None = None
-        self._scan: _Sighting | None = None
-        self._seen: list[_Sighting] = []
         self._publisher = self.create_publisher(Twist, "cmd_vel", 10)
         self.create_subscription(Odometry, "odometry/filtered", self._on_odometry, 10)
         self.create_subscription(LaserScan, "scan", self._on_scan, 2)
@@ -136,51 +133,19 @@ class PolicyControllerNode(Node):
         self._poses.on_odometry(msg)
 
     def _on_path(self, msg: Path) -> None:
-        path = path_to_numpy(msg)
-        check_finite("plan", path)
-        self._path = path
-        # A path of one pose asks for its heading too; a longer one leaves the last heading open.
-        self._final_yaw = quaternion_to_yaw(msg.poses[0].pose.orientation) if len(msg.poses) == 1 else None
+        self._path, self._final_yaw = read_plan(msg)
 
     def _on_scan(self, msg: LaserScan) -> None:
-        if not self._frames.sensor("scan", msg):
-            return
-        ranges, angles = scan_to_arrays(msg)
-        # REP 117: -inf is too near to measure, +inf no return, NaN an error; none of them is a place.
-        near = np.isfinite(ranges) & (ranges < LIDAR_RANGE)
-        local = ranges[near, None] * np.stack([np.cos(angles[near]), np.sin(angles[near])], axis=1)
-        stamp = time_to_ns(msg.header.stamp)
-        charge_work("near_points", len(ranges))
-
-        def keep(pose: Pose) -> None:
-            self._scan = _Sighting(stamp, transform(pose, local))
-
-        self._poses.when_known(stamp, keep)
+        self._sightings.take_scan(msg)
 
     def _on_points(self, msg: PointCloud2) -> None:
-        if not self._frames.expect("perception/points", msg, "base_link"):
-            return
-        points = cloud_to_points(msg).astype(np.float64)
-        local = points[points[:, 2] != FLOOR_LABEL, :2]
-        local = thin_out(local[np.hypot(local[:, 0], local[:, 1]) < self._params.points_range])
-        charge_work("thin_out", len(points))
-        stamp = time_to_ns(msg.header.stamp)
-        if len(local):
-            self._poses.when_known(stamp, lambda pose: self._seen.append(_Sighting(stamp, transform(pose, local))))
-
-    def _obstacles(self, pose: Pose, now: int) -> NDArray[np.float64]:
-        """Return what was seen of obstacles, (M, 2) in the robot's frame as it stands now."""
-        self._seen = [s for s in self._seen if now - s.stamp_ns < self._params.points_max_age * 1e9]
-        world = [s.points for s in self._seen]
-        if self._scan is not None:
-            world.append(self._scan.points)
-        return transform(inverse(pose), np.concatenate(world)) if world else np.zeros((0, 2))
+        self._sightings.take_points(msg)
 
     def _control(self) -> None:
         pose = self._poses.latest()
         now = self.get_clock().now().nanoseconds
         speed = turn = 0.0
-        fresh = self._scan is not None and now - self._scan.stamp_ns < self._params.scan_max_age * 1e9
+        fresh = self._sightings.fresh(now, self._params.scan_max_age)
         if pose is not None and fresh and len(self._path):
             speed, turn = self._command(pose, now)
         else:
@@ -197,7 +162,7 @@ class PolicyControllerNode(Node):
             if abs(error) < params.arrive_yaw:
                 return 0.0, 0.0
             return 0.0, float(np.clip(params.turn_gain * error, -params.max_turn, params.max_turn))
-        obstacles = self._obstacles(pose, now)
+        obstacles = self._sightings.around(pose, now)
         charge_work("obstacles", len(obstacles))
         goal = transform(inverse(pose), lookahead_point(self._path, position, params.lookahead))
         seen = observation(self._velocity, goal, sector_ranges(obstacles), self._last_action)

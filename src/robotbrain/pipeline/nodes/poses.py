@@ -7,13 +7,14 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from nav_msgs.msg import Odometry
+from nav_msgs.msg import Odometry, Path
+from numpy.typing import NDArray
 from rclpy.node import Node
 
 from robotbrain.errors import InputError
 from robotbrain.pipeline.geometry import Pose, PoseBuffer
 from robotbrain.ros import charge_work
-from robotbrain.ros.conversions import pose_to_xy_yaw, time_to_ns
+from robotbrain.ros.conversions import path_to_numpy, pose_to_xy_yaw, quaternion_to_yaw, time_to_ns
 
 
 def check_finite(topic: str, values: object) -> None:
@@ -25,6 +26,19 @@ def check_finite(topic: str, values: object) -> None:
             expected="finite numbers",
             fix=f"Look at the node that publishes {topic}: it computes with NaN or infinity.",
         )
+
+
+def read_plan(msg: Path) -> tuple[NDArray[np.float64], float | None]:
+    """Return the points of a plan, (N, 2) in m, and the heading it asks for at its end (rad), if it asks for one.
+
+    A path of one pose asks for its heading too; a longer one leaves the last heading open.
+
+    Raises:
+        InputError: points that are not finite.
+    """
+    path = path_to_numpy(msg)
+    check_finite("plan", path)
+    return path, quaternion_to_yaw(msg.poses[0].pose.orientation) if len(msg.poses) == 1 else None
 
 
 FIXED_FRAMES = ("map", "odom", "world", "earth")
