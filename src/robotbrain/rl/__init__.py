@@ -6,8 +6,9 @@ one by name. The names here are loaded when first used, so that importing the pa
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from robotbrain.lazy import lazy
 
 if TYPE_CHECKING:
     from robotbrain.rl.configclass import MISSING, configclass
@@ -64,13 +65,4 @@ __all__ = [
     "make_vec",
     "task_cfg",
 ]
-
-
-def __getattr__(name: str) -> Any:
-    if name in _MODULE_OF:
-        return getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    return [*globals(), *__all__]
+__getattr__, __dir__ = lazy(__name__, _MODULE_OF, globals())

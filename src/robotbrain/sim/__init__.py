@@ -6,8 +6,9 @@ names are loaded when first used, so that importing the package stays cheap.
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from robotbrain.lazy import lazy
 
 if TYPE_CHECKING:
     from robotbrain.sim.camera import CameraExtrinsics, CameraImage, CameraIntrinsics, RayCamera
@@ -81,13 +82,4 @@ _HOME = {
     "world": ("Look", "Obstacle", "World", "WorldSpec"),
 }
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
-
-
-def __getattr__(name: str) -> Any:
-    if name in _MODULE_OF:
-        return getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    return [*globals(), *__all__]
+__getattr__, __dir__ = lazy(__name__, _MODULE_OF, globals())

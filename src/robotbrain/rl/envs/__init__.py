@@ -5,9 +5,9 @@ The configuration is cheap to import; the rest brings in MuJoCo, torch and Gymna
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from robotbrain.lazy import lazy
 from robotbrain.rl.envs.manager_based_rl_env_cfg import ManagerBasedRLEnvCfg
 from robotbrain.rl.scene.scene_cfg import SimulationCfg
 
@@ -18,13 +18,4 @@ if TYPE_CHECKING:
 __all__ = ["ManagerBasedRLEnv", "ManagerBasedRLEnvCfg", "SimulationCfg", "TaskEnv", "TaskVectorEnv"]
 
 _MODULE_OF = {"ManagerBasedRLEnv": "manager_based_rl_env", "TaskEnv": "gym", "TaskVectorEnv": "gym"}
-
-
-def __getattr__(name: str) -> Any:
-    if name in _MODULE_OF:
-        return getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    return [*globals(), *_MODULE_OF]
+__getattr__, __dir__ = lazy(__name__, _MODULE_OF, globals())

@@ -5,9 +5,9 @@ Configurations (``...Cfg``) are cheap to import; the managers bring in torch whe
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from robotbrain.lazy import lazy
 from robotbrain.rl.managers.manager_term_cfg import (
     ActionTermCfg,
     CommandTermCfg,
@@ -68,13 +68,4 @@ _MODULE_OF = {
     "RewardManager": "reward_manager",
     "TerminationManager": "termination_manager",
 }
-
-
-def __getattr__(name: str) -> Any:
-    if name in _MODULE_OF:
-        return getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    return [*globals(), *_MODULE_OF]
+__getattr__, __dir__ = lazy(__name__, _MODULE_OF, globals())

@@ -5,9 +5,9 @@ Configurations are cheap to import; the rest brings in MuJoCo and torch when it 
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from robotbrain.lazy import lazy
 from robotbrain.rl.scene.scene_cfg import (
     ArticulationCfg,
     ContactSensorCfg,
@@ -50,13 +50,4 @@ _MODULE_OF = {
     "TensorView": "world",
     "World": "world",
 }
-
-
-def __getattr__(name: str) -> Any:
-    if name in _MODULE_OF:
-        return getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    return [*globals(), *_MODULE_OF]
+__getattr__, __dir__ = lazy(__name__, _MODULE_OF, globals())

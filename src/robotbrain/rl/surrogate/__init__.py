@@ -8,8 +8,9 @@ serial number; the parameters follow from it and are unknown to the student. ``S
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from robotbrain.lazy import lazy
 
 if TYPE_CHECKING:
     from robotbrain.rl.surrogate.fleet import Readings, Surrogate, SurrogateFleet
@@ -38,13 +39,4 @@ _HOME = {
     "velocity": ("Walks", "walk"),
 }
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
-
-
-def __getattr__(name: str) -> Any:
-    if name in _MODULE_OF:
-        return getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    return [*globals(), *__all__]
+__getattr__, __dir__ = lazy(__name__, _MODULE_OF, globals())
