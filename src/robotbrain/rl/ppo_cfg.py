@@ -179,6 +179,55 @@ class RslRlOnPolicyRunnerCfg(RslRlBaseRunnerCfg):
     torch_compile_mode: Literal["default", "max-autotune-no-cudagraphs"] | None = None
 
 
+def usual_runner_cfg(
+    name: str,
+    group: str = "policy",
+    *,
+    iterations: int = 1000,
+    save_interval: int = 50,
+    init_std: float = 1.0,
+    gamma: float = 0.99,
+    entropy_coef: float = 0.005,
+) -> RslRlOnPolicyRunnerCfg:
+    """Return the settings that many tasks of Isaac Lab begin with.
+
+    Args:
+        name: of the experiment.
+        group: of observations, which actor and critic see.
+        iterations, save_interval: ``max_iterations`` and how often a checkpoint is written.
+        init_std: of the exploration, in the action's unit.
+        gamma, entropy_coef: of PPO.
+    """
+    return RslRlOnPolicyRunnerCfg(
+        num_steps_per_env=24,
+        max_iterations=iterations,
+        save_interval=save_interval,
+        experiment_name=name,
+        obs_groups={"actor": [group], "critic": [group]},
+        actor=RslRlMLPModelCfg(
+            hidden_dims=[128, 128],
+            activation="elu",
+            obs_normalization=True,
+            distribution_cfg=RslRlMLPModelCfg.GaussianDistributionCfg(init_std=init_std),
+        ),
+        critic=RslRlMLPModelCfg(hidden_dims=[128, 128], activation="elu", obs_normalization=True),
+        algorithm=RslRlPpoAlgorithmCfg(
+            num_learning_epochs=5,
+            num_mini_batches=4,
+            learning_rate=1e-3,
+            schedule="adaptive",
+            gamma=gamma,
+            lam=0.95,
+            entropy_coef=entropy_coef,
+            desired_kl=0.01,
+            max_grad_norm=1.0,
+            value_loss_coef=1.0,
+            use_clipped_value_loss=True,
+            clip_param=0.2,
+        ),
+    )
+
+
 def model_cfg(values: Mapping[str, Any]) -> RslRlMLPModelCfg:
     """Return the configuration of a network from what its ``to_dict`` gave."""
     plain = dict(values)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from robotbrain.errors import InputError
 from robotbrain.rl.configclass import did_you_mean
-from robotbrain.rl.ppo_cfg import RslRlMLPModelCfg, RslRlOnPolicyRunnerCfg, RslRlPpoAlgorithmCfg
+from robotbrain.rl.ppo_cfg import RslRlOnPolicyRunnerCfg, usual_runner_cfg
 from robotbrain.rl.registry import TASKS
 
 if TYPE_CHECKING:
@@ -41,35 +41,9 @@ def ppo_recipe(task: str) -> RslRlOnPolicyRunnerCfg:
     if found is not None:
         cfg: RslRlOnPolicyRunnerCfg = found()
         return cfg
-    return RslRlOnPolicyRunnerCfg(
-        num_steps_per_env=24,
-        max_iterations=500,
-        save_interval=25,
-        experiment_name=task,
-        obs_groups={"actor": ["policy"], "critic": ["policy"]},
-        clip_actions=1.0,
-        actor=RslRlMLPModelCfg(
-            hidden_dims=[128, 128],
-            activation="elu",
-            obs_normalization=True,
-            distribution_cfg=RslRlMLPModelCfg.GaussianDistributionCfg(init_std=0.6),
-        ),
-        critic=RslRlMLPModelCfg(hidden_dims=[128, 128], activation="elu", obs_normalization=True),
-        algorithm=RslRlPpoAlgorithmCfg(
-            num_learning_epochs=5,
-            num_mini_batches=4,
-            learning_rate=1e-3,
-            schedule="adaptive",
-            gamma=0.98,
-            lam=0.95,
-            entropy_coef=0.0,
-            desired_kl=0.01,
-            max_grad_norm=1.0,
-            value_loss_coef=1.0,
-            use_clipped_value_loss=True,
-            clip_param=0.2,
-        ),
-    )
+    usual = usual_runner_cfg(task, iterations=500, save_interval=25, init_std=0.6, gamma=0.98, entropy_coef=0.0)
+    usual.clip_actions = 1.0
+    return usual
 
 
 def ddpg_recipe(task: str) -> DDPGConfig:

@@ -23,7 +23,7 @@ from robotbrain.rl.isaaclab._robot import RobotFiles, robot_files
 from robotbrain.rl.isaaclab._source import Sources
 from robotbrain.rl.isaaclab._texts import header, order_notes, pascal
 from robotbrain.rl.mdp.events import reset_scene_to_default
-from robotbrain.rl.ppo_cfg import RslRlMLPModelCfg, RslRlOnPolicyRunnerCfg, RslRlPpoAlgorithmCfg
+from robotbrain.rl.ppo_cfg import RslRlOnPolicyRunnerCfg, usual_runner_cfg
 from robotbrain.rl.scene.interactive_scene import InteractiveScene
 from robotbrain.rl.scene.scene_cfg import ArticulationCfg, ContactSensorCfg, LidarCfg, entities
 
@@ -84,7 +84,9 @@ def export_isaaclab(
     parts = [_scene_code(cfg, robots, scene, emitter)]
     parts += [_container_code(field, getattr(cfg, field), emitter) for field in _CONTAINERS if _has(cfg, field)]
     parts.append(_env_code(name, cfg, scene))
-    agent = common_agent(name, cfg) if agent is None else agent
+    if agent is None:
+        groups = cfg.observations if isinstance(cfg.observations, dict) else vars(cfg.observations)
+        agent = usual_runner_cfg(name, next(iter(groups), "policy"))
     agent.validate()
     parts += [_agent_code(name, agent, emitter), _registration(name)]
     module = "\n\n".join([header(name, cfg, robots), *_preamble(sources), *(part.strip("\n") + "\n" for part in parts)])
@@ -278,39 +280,6 @@ def _agent_code(name: str, agent: RslRlOnPolicyRunnerCfg, emitter: Emitter) -> s
         if value is not default and value != default:
             lines.append(f"    {field} = {emitter.value(value, f'agent.{field}', 4)}")
     return f"@configclass\nclass {pascal(name)}PPORunnerCfg(RslRlOnPolicyRunnerCfg):\n" + "\n".join(lines)
-
-
-def common_agent(name: str, cfg: ManagerBasedRLEnvCfg) -> RslRlOnPolicyRunnerCfg:
-    """PPO settings that many tasks of Isaac Lab begin with; the critic sees what the actor sees."""
-    groups = list(cfg.observations if isinstance(cfg.observations, dict) else vars(cfg.observations))
-    return RslRlOnPolicyRunnerCfg(
-        num_steps_per_env=24,
-        max_iterations=1000,
-        save_interval=50,
-        experiment_name=name,
-        obs_groups={"actor": groups[:1], "critic": groups[:1]},
-        actor=RslRlMLPModelCfg(
-            hidden_dims=[128, 128],
-            activation="elu",
-            obs_normalization=True,
-            distribution_cfg=RslRlMLPModelCfg.GaussianDistributionCfg(init_std=1.0),
-        ),
-        critic=RslRlMLPModelCfg(hidden_dims=[128, 128], activation="elu", obs_normalization=True),
-        algorithm=RslRlPpoAlgorithmCfg(
-            num_learning_epochs=5,
-            num_mini_batches=4,
-            learning_rate=1e-3,
-            schedule="adaptive",
-            gamma=0.99,
-            lam=0.95,
-            entropy_coef=0.005,
-            desired_kl=0.01,
-            max_grad_norm=1.0,
-            value_loss_coef=1.0,
-            use_clipped_value_loss=True,
-            clip_param=0.2,
-        ),
-    )
 
 
 def _registration(name: str) -> str:
