@@ -9,19 +9,16 @@ Usage: python benchmarks/rl_navigation.py [--worlds 20] [--episodes 512] [--run 
 from __future__ import annotations
 
 import argparse
-import datetime
 import json
-import os
-import platform
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import rl_shipping
 from tqdm import tqdm
 
-import robotbrain
 from robotbrain import files
 from robotbrain.monitoring.accuracy import wilson_interval
 from robotbrain.pipeline.brain import drive
@@ -106,36 +103,19 @@ def lab(model: Path | None, options: dict[str, Any], seeds: Sequence[int], name:
 
 def ship(folder: Path, rows: list[dict[str, Any]]) -> None:
     """Make the training in ``folder`` the shipped one: ONNX, curve and recipe."""
-    import torch
-
     from robotbrain.rl.checkpoint import load_checkpoint
     from robotbrain.rl.logs import read_run
     from robotbrain.rl.ppo_train import CHECKPOINT_FILE, KIND
     from robotbrain.rl.tasks import navigation
 
     saved, run = load_checkpoint(folder / CHECKPOINT_FILE, kind=KIND), read_run(folder)
-    cost = run["train/return"]
-    at = int(np.searchsorted(cost.step, saved["steps"], side="right")) - 1
     recipe = {
-        "command": f"robotbrain rl train navigation --seed {saved['cfg']['seed']} --iterations {saved['iteration']}",
-        "task": "navigation",
-        "algorithm": "PPO (robotbrain.rl.ppo) with left-right mirror images",
-        "seed": saved["cfg"]["seed"],
-        "num_envs": saved["num_envs"],
-        "iterations": saved["iteration"],
-        "env_steps": saved["steps"],
-        "minutes": round(float(cost.elapsed_s[at]) / 60, 1),
-        "machine": f"{os.cpu_count()} CPU cores ({_processor()}), no GPU, shared with other work",
-        "threads": run.settings.get("threads"),
-        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
-        "kit_version": robotbrain.__version__,
-        "torch": torch.__version__.split("+")[0],
-        "config_hash": navigation.config_hash(),
+        **rl_shipping.recipe("navigation", saved, run, navigation.config_hash()),
         "evaluation": rows,
     }
     files.write_text(navigation.SHIPPED_RECIPE, json.dumps(recipe, indent=1) + "\n")
-    files.write_text(navigation.SHIPPED_CURVE, json.dumps(_curve(run, saved["steps"])) + "\n")
-    _export(folder, default_policy(), {name: recipe[name] for name in ("command", "env_steps", "config_hash", "date")})
+    files.write_text(navigation.SHIPPED_CURVE, json.dumps(rl_shipping.curve(run, saved["steps"], CURVE, POINTS)) + "\n")
+    _export(folder, default_policy(), rl_shipping.origin(recipe))
 
 
 def _export(folder: Path, target: Path, origin: dict[str, Any]) -> Path:
@@ -143,25 +123,6 @@ def _export(folder: Path, target: Path, origin: dict[str, Any]) -> Path:
     from robotbrain.rl.ppo_train import CHECKPOINT_FILE, load_actor
 
     return export_policy(load_actor(folder / CHECKPOINT_FILE), target, policy_meta(origin))
-
-
-def _curve(run: Any, last_step: int) -> dict[str, Any]:
-    """Return the training's figures, each point the mean over its share of the steps."""
-    edges = np.linspace(0, last_step, POINTS + 1)
-    curve: dict[str, Any] = {"env_steps": edges[1:].astype(int).tolist()}
-    for name, source in CURVE.items():
-        series = run[source]
-        bins = np.digitize(series.step, edges, right=True) - 1
-        means = [float(np.nanmean(v)) if (v := series.value[bins == i]).size else None for i in range(POINTS)]
-        curve[name] = [None if m is None else round(m, 4) for m in means]
-    return curve
-
-
-def _processor() -> str:
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.is_file() else []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
 
 
 def main() -> None:

@@ -12,18 +12,14 @@ Usage: python benchmarks/rl_velocity.py [--commands 200] [--run FOLDER [--ship]]
 from __future__ import annotations
 
 import argparse
-import datetime
 import json
-import os
-import platform
 import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
+import rl_shipping
 
-import robotbrain
 from robotbrain import files
 from robotbrain.rl.checkpoint import load_checkpoint, save_checkpoint
 from robotbrain.rl.evaluate import clopper_pearson
@@ -87,23 +83,8 @@ def table(rows: list[dict[str, Any]]) -> str:
 def ship(folder: Path, rows: list[dict[str, Any]], note: str) -> None:
     """Make the training in ``folder`` the shipped one: checkpoint without the simulation, ONNX, curve and recipe."""
     saved, run = load_checkpoint(folder / CHECKPOINT_FILE, kind=KIND), read_run(folder)
-    cost = run["train/return"]
-    at = int(np.searchsorted(cost.step, saved["steps"], side="right")) - 1
     recipe = {
-        "command": f"robotbrain rl train velocity --seed {saved['cfg']['seed']} --iterations {saved['iteration']}",
-        "task": "velocity",
-        "algorithm": "PPO (robotbrain.rl.ppo) with left-right mirror images",
-        "seed": saved["cfg"]["seed"],
-        "num_envs": saved["num_envs"],
-        "iterations": saved["iteration"],
-        "env_steps": saved["steps"],
-        "minutes": round(float(cost.elapsed_s[at]) / 60, 1),
-        "machine": f"{os.cpu_count()} CPU cores ({_processor()}), no GPU, shared with other work",
-        "threads": run.settings.get("threads"),
-        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
-        "kit_version": robotbrain.__version__,
-        "torch": torch.__version__.split("+")[0],
-        "config_hash": velocity.config_hash(),
+        **rl_shipping.recipe("velocity", saved, run, velocity.config_hash()),
         "observations": [list(pair) for pair in velocity.OBSERVATIONS],
         "action_scale": velocity.ACTION_SCALE,
         "note": note,
@@ -119,27 +100,9 @@ def ship(folder: Path, rows: list[dict[str, Any]], note: str) -> None:
         keep_previous=False,
     )
     files.write_text(velocity.SHIPPED_RECIPE, json.dumps(recipe, indent=1) + "\n")
-    files.write_text(velocity.SHIPPED_CURVE, json.dumps(_curve(run, saved["steps"])) + "\n")
-    origin = {name: recipe[name] for name in ("command", "env_steps", "config_hash", "date")}
-    export_policy(load_actor(velocity.SHIPPED_CHECKPOINT), velocity.SHIPPED_ONNX, velocity.policy_meta(origin))
-
-
-def _curve(run: Any, last_step: int) -> dict[str, Any]:
-    """Return the training's figures, each point the mean over its share of the steps."""
-    edges = np.linspace(0, last_step, POINTS + 1)
-    curve: dict[str, Any] = {"env_steps": edges[1:].astype(int).tolist()}
-    for name, source in CURVE.items():
-        series = run[source]
-        place = np.digitize(series.step, edges, right=True) - 1
-        means = [float(np.nanmean(v)) if (v := series.value[place == i]).size else None for i in range(POINTS)]
-        curve[name] = [None if m is None else round(m, 4) for m in means]
-    return curve
-
-
-def _processor() -> str:
-    info = Path("/proc/cpuinfo")
-    names = [line.partition(":")[2].strip() for line in info.read_text().splitlines() if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
+    files.write_text(velocity.SHIPPED_CURVE, json.dumps(rl_shipping.curve(run, saved["steps"], CURVE, POINTS)) + "\n")
+    meta = velocity.policy_meta(rl_shipping.origin(recipe))
+    export_policy(load_actor(velocity.SHIPPED_CHECKPOINT), velocity.SHIPPED_ONNX, meta)
 
 
 def main(arguments: list[str] | None = None) -> int:
