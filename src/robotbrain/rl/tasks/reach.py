@@ -4,7 +4,7 @@ Targets are uniform over 0.3 m^3 in front of the arm; an episode is 50 control s
 reached when the fingertips are within 2 cm of it over the last 5 steps. The structure is that of Isaac Lab 3.0's reach
 task; its orientation part is left out, and three terms are the kit's own (`robotbrain.rl.mdp.extra`).
 
-The plain distance as reward (`ReachDistanceEnvCfg`) stalls near 2 cm: its slope is the same everywhere, so that far
+The plain distance as reward (`ReachDistanceEnvCfg`) hovers about 2 cm: its slope is the same everywhere, so that far
 targets drown out the last centimetres. `ReachEnvCfg` adds a term that only matters there.
 """
 
