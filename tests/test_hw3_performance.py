@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import nbformat
 import numpy as np
 import pytest
 
 from robotbrain.errors import InputError
-from robotbrain.grading import Suite, load_hidden_suite, mutation
-from robotbrain.grading.classroom import ClassResult, grade_class
+from robotbrain.grading import Suite, load_hidden_suite
 from robotbrain.grading.course import find_course, release_differences
-from robotbrain.grading.sample import load_mutants, make_class
+from robotbrain.grading.sample import load_mutants
 from robotbrain.grading.suites import hw3_performance_tools as tools
 from robotbrain.grading.suites import hw3_performance_traces as traces
 from robotbrain.grading.suites import hw3_performance_verdict as verdict
 from robotbrain.pipeline.inherited import BrainSetup, inherited_brain, unmet_requirements
-from tests.conftest import graders
+from tests import classes
 
 LAB = "hw3_performance"
 
@@ -162,43 +161,27 @@ def test_what_the_homework_tells_about_the_patient_is_true(repo: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def graded(repo: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[ClassResult, dict]:
-    out = tmp_path_factory.mktemp("class")
-    course = find_course(repo)
-    manifest = make_class(course, LAB, out / "class")
+def graded(repo: Path, tmp_path_factory: pytest.TempPathFactory) -> classes.Graded:
     seen = set()
-    for student, entry in list(manifest.items()):
+
+    def keep(entry: dict[str, Any]) -> bool:
         # Here one mutant for each exercise, the styles and the stub; `make mutation-test` grades all.
         exercise = entry.get("exercise")
-        keep = entry["kind"] in ("reference", "style", "stub") or (entry["kind"] == "mutant" and exercise not in seen)
+        first = entry["kind"] == "mutant" and exercise not in seen
         seen.add(exercise)
-        if not keep:
-            shutil.rmtree(out / "class" / student)
-            del manifest[student]
-    return grade_class(course, LAB, submitted=out / "class", out=out / "graded", workers=graders()), manifest
+        return first or entry["kind"] in ("reference", "style", "stub")
+
+    return classes.grade_sample(repo, LAB, tmp_path_factory.mktemp("class"), keep)
 
 
 @pytest.mark.timeout(1200)
-def test_every_mutant_loses_its_own_points_only_and_every_style_gets_all(graded: tuple[ClassResult, dict]) -> None:
-    result, manifest = graded
-    rows = mutation.judge(result.to_dict(), manifest)
-    assert len(rows) == len(manifest) >= 15
-    assert not [row for row in rows if row.problems], mutation.table(rows)
+def test_every_mutant_loses_its_own_points_only_and_every_style_gets_all(graded: classes.Graded) -> None:
+    classes.check_losses(graded, at_least=15)
 
 
-def test_every_submission_ends_in_a_grade_and_a_feedback_page(graded: tuple[ClassResult, dict]) -> None:
-    result, manifest = graded
-    assert {row.student for row in result.rows} == set(manifest)
-    for row in result.rows:
-        pages = list((result.feedback / row.student / LAB).glob("*.html"))
-        assert len(pages) == 1, row.student
-        if row.verdict != "full":
-            assert row.reason(), row.student
+def test_every_submission_ends_in_a_grade_and_a_feedback_page(graded: classes.Graded) -> None:
+    classes.check_pages(graded, LAB)
 
 
-def test_hidden_tests_do_not_show_in_feedback(graded: tuple[ClassResult, dict]) -> None:
-    result, _ = graded
-    for row in result.rows:
-        page = next((result.feedback / row.student / LAB).glob("*.html")).read_text(encoding="utf-8")
-        for secret in ("student.rng", "_random_trace", "compare_ages", "autograder/hidden"):
-            assert secret not in page, f"{row.student}: {secret}"
+def test_hidden_tests_do_not_show_in_feedback(graded: classes.Graded) -> None:
+    classes.check_secrets(graded, LAB, "_random_trace", "compare_ages")

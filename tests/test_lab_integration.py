@@ -7,11 +7,10 @@ from pathlib import Path
 import nbformat
 import pytest
 
-from robotbrain.grading import Suite, load_hidden_suite, mutation
-from robotbrain.grading.classroom import ClassResult, grade_class
+from robotbrain.grading import Suite, load_hidden_suite
 from robotbrain.grading.course import find_course, release_differences
-from robotbrain.grading.sample import load_mutants, make_class
-from tests.conftest import graders
+from robotbrain.grading.sample import load_mutants
+from tests import classes
 
 LAB = "lab_integration"
 
@@ -49,34 +48,18 @@ def test_every_hint_and_every_mutant_is_of_use(repo: Path, suite: Suite) -> None
 
 
 @pytest.fixture(scope="module")
-def graded(repo: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[ClassResult, dict]:
-    out = tmp_path_factory.mktemp("class")
-    course = find_course(repo)
-    manifest = make_class(course, LAB, out / "class")
-    return grade_class(course, LAB, submitted=out / "class", out=out / "graded", workers=graders()), manifest
+def graded(repo: Path, tmp_path_factory: pytest.TempPathFactory) -> classes.Graded:
+    return classes.grade_sample(repo, LAB, tmp_path_factory.mktemp("class"))
 
 
 @pytest.mark.timeout(1200)
-def test_every_mutant_loses_its_own_points_only_and_every_style_gets_all(graded: tuple[ClassResult, dict]) -> None:
-    result, manifest = graded
-    rows = mutation.judge(result.to_dict(), manifest)
-    assert len(rows) == len(manifest) >= 35
-    assert not [row for row in rows if row.problems], mutation.table(rows)
+def test_every_mutant_loses_its_own_points_only_and_every_style_gets_all(graded: classes.Graded) -> None:
+    classes.check_losses(graded, at_least=35)
 
 
-def test_every_submission_ends_in_a_grade_and_a_feedback_page(graded: tuple[ClassResult, dict]) -> None:
-    result, manifest = graded
-    assert {row.student for row in result.rows} == set(manifest)
-    for row in result.rows:
-        pages = list((result.feedback / row.student / LAB).glob("*.html"))
-        assert len(pages) == 1, row.student
-        if row.verdict != "full":
-            assert row.reason(), row.student
+def test_every_submission_ends_in_a_grade_and_a_feedback_page(graded: classes.Graded) -> None:
+    classes.check_pages(graded, LAB)
 
 
-def test_hidden_tests_do_not_show_in_feedback(graded: tuple[ClassResult, dict]) -> None:
-    result, _ = graded
-    for row in result.rows:
-        page = next((result.feedback / row.student / LAB).glob("*.html")).read_text(encoding="utf-8")
-        for secret in ("student.rng", "_random_cost", "compare_astar", "autograder/hidden"):
-            assert secret not in page, f"{row.student}: {secret}"
+def test_hidden_tests_do_not_show_in_feedback(graded: classes.Graded) -> None:
+    classes.check_secrets(graded, LAB, "_random_cost", "compare_astar")
