@@ -155,6 +155,21 @@ def test_resuming_continues_bit_by_bit(tmp_path: Any) -> None:
     assert equal(expected, run(other, 60, reset=False))
 
 
+def test_derived_constants_are_resumed_where_no_event_has_run_yet() -> None:
+    cfg = tiny.WalkerCfg(events=HeavyEventsCfg())
+    cfg.events.heavier.mode, cfg.events.heavier.interval_range_s = "interval", (0.02, 0.05)
+    env = ManagerBasedRLEnv(cfg, num_threads=1)
+    env.reset(seed=1)
+    for action in actions(env, 20):
+        env.step(action)
+    state = env.state_dict()
+    expected = run(env, 3, reset=False)
+    fresh = ManagerBasedRLEnv(cfg, num_threads=1)
+    assert not fresh.scene.world.has_own_constants
+    fresh.load_state_dict(state)
+    assert equal(expected, run(fresh, 3, reset=False))
+
+
 def test_a_state_of_another_size_is_refused() -> None:
     env = ManagerBasedRLEnv(tiny.ArmCfg(), num_threads=1)
     state = env.state_dict()
@@ -234,6 +249,7 @@ def test_a_diverged_state_ends_that_environment_only() -> None:
         assert got[2].tolist() == [False, False, step == 3, False]
         assert torch.equal(got[0]["policy"][others], want[0]["policy"][others])
         assert all(torch.isfinite(v).all() for v in (got[0]["policy"], got[1]))
+    assert results[3][1][2] == 0.0 != expected[3][1][2]  # the default state earns nothing
     assert results[3][4]["log"]["Episode_Termination/non_finite_state"] == 1
     assert env.episode_length_buf.tolist() == [6, 6, 2, 6]
 

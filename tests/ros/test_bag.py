@@ -685,6 +685,10 @@ def test_command(tmp_path, context, capsys):
     assert code == 0 and "written again: bag_0.mcap" in out
     assert command(capsys, "check", path)[0] == 0
 
+    (tmp_path / "empty.mcap").touch()
+    code, out = command(capsys, "recover", tmp_path / "empty.mcap")
+    assert code == 1 and "no message to save" in out
+
 
 def test_check_finds_what_cannot_be_decoded(tmp_path, context, capsys):
     with BagWriter(tmp_path / "bag") as bag:

@@ -134,6 +134,9 @@ def _recover(arguments: argparse.Namespace) -> int:
         f"{arguments.path}: {done.messages} messages; "
         + (f"written again: {', '.join(done.rewritten)}" if done.rewritten else "it was whole already")
     )
+    if done.rewritten and not done.messages:
+        print("robotbrain bag recover: there was no message to save", file=sys.stderr)
+        return 1
     return 0
 
 

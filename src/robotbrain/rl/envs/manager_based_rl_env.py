@@ -198,6 +198,9 @@ class ManagerBasedRLEnv:
         terminations = self.termination_manager
         ended = terminations.compute(diverged)
         reward = self.reward_manager.compute(self.step_dt)
+        if diverged is not None:
+            # These environments stand in their default state already: what the terms see there was not earned.
+            self.reward_manager.forget(diverged.nonzero().flatten())
         if not math.isfinite(reward.sum().item()):
             ended = self._drop_rewards(reward)
         if self.cfg.only_positive_rewards:
@@ -229,6 +232,7 @@ class ManagerBasedRLEnv:
             "version": STATE_VERSION,
             "physics": torch.from_numpy(world.rows.copy()),
             "model": world.expanded_fields(),
+            "own_constants": world.has_own_constants,
             "stage": world.stage,
             "generator": self.generator.get_state(),
             "episode_length_buf": self.episode_length_buf.clone(),
@@ -259,7 +263,7 @@ class ManagerBasedRLEnv:
             )
         for name in _MANAGERS:
             getattr(self, name).load_state_dict(state["managers"][name])
-        world.load_expanded_fields(state["model"])
+        world.load_expanded_fields(state["model"], bool(state.get("own_constants", False)))
         world.stage = max(world.stage, int(state["stage"]))
         np.copyto(world.rows, physics.numpy())
         world.mark_written(None)

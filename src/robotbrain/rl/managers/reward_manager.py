@@ -32,6 +32,7 @@ class RewardManager(ManagerBase):
         self._log_names = tuple(f"Episode_Reward/{name}" for name in self._terms)
         n = env.num_envs
         self._weights: tuple[float, ...] = ()
+        self._dt = 0.0
         self._weight_column = torch.zeros(0, 1)
         self._step_terms = torch.zeros(len(self._terms), n)
         self._episode_sums = torch.zeros(len(self._terms), n)
@@ -74,6 +75,7 @@ class RewardManager(ManagerBase):
     def compute(self, dt: float) -> torch.Tensor:
         """The reward of a step of ``dt`` seconds, (num_envs,); a new tensor each time."""
         env = self._env
+        self._dt = dt
         weights, values, rows = [], [], []
         for row, term in enumerate(self._terms.values()):
             weight = term.weight
@@ -96,15 +98,16 @@ class RewardManager(ManagerBase):
         return self._reward
 
     def forget(self, env_ids: torch.Tensor) -> list[str]:
-        """Take back the last step's reward of environments where it is not finite.
+        """Take back the last step's reward of environments whose state or reward was not finite.
 
         Returns:
             The names of the terms that were not finite.
         """
-        bad = ~torch.isfinite(self._step_terms[:, env_ids]).all(1)
+        terms = self._step_terms[:, env_ids]
+        bad = ~torch.isfinite(terms).all(1)
         self._step_terms[:, env_ids] = 0.0
         self._reward[env_ids] = 0.0
-        sums = self._episode_sums[:, env_ids]
+        sums = self._episode_sums[:, env_ids] - self._dt * terms
         self._episode_sums[:, env_ids] = torch.where(torch.isfinite(sums), sums, 0.0)
         return [name for name, is_bad in zip(self._terms, bad.tolist(), strict=True) if is_bad]
 

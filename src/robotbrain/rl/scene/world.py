@@ -222,12 +222,22 @@ class World:
         """Copies of the model fields that differ between environments."""
         return {name: torch.from_numpy(values.copy()) for name, values in self._expanded.items()}
 
-    def load_expanded_fields(self, fields: dict[str, torch.Tensor]) -> None:
-        """Put back :meth:`expanded_fields`; MuJoCo's derived constants follow."""
+    @property
+    def has_own_constants(self) -> bool:
+        """Whether derived constants were ever computed anew from fields that differ between environments."""
+        return self._const_dirty is not None
+
+    def load_expanded_fields(self, fields: dict[str, torch.Tensor], constants: bool = False) -> None:
+        """Put back :meth:`expanded_fields`; MuJoCo's derived constants follow.
+
+        Args:
+            fields: as given there.
+            constants: :attr:`has_own_constants` of the world they come from.
+        """
         for name in {*fields, *self._expanded}:
             live = self.expand(name)
             np.copyto(live, fields[name].numpy() if name in fields else _model_value(self.model, name))
-        if self._const_dirty is not None:
+        if constants or self.has_own_constants:
             self.mark_const_dirty(None)
 
     def _recompute(self, ids: npt.NDArray[np.int64] | None) -> None:
