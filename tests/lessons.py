@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import nbformat
+import pytest
 from nbclient import NotebookClient
 
 from robotbrain import notebooks
@@ -118,3 +119,42 @@ def check(suite: str, exercise: str, **answers: Any) -> Report:
 def hints(report: Report) -> set[str]:
     """Return the keys of the hints that a report gives."""
     return {result.hint_key for result in report.results if result.hint_key}
+
+
+class LessonTests:
+    """The tests that every lesson must pass; the ``TestLesson`` of each says what is its own.
+
+    Attributes:
+        notebook: file name in ``course/``.
+        exercises: their digits.
+        figures, tables: how many there are at least.
+        claims: what the prose says about results, as code that runs as a last cell.
+        timeout: of a cell, s.
+    """
+
+    notebook: str
+    exercises: str
+    figures: int
+    tables: int = 0
+    claims: str = ""
+    timeout: int = 90
+
+    @pytest.fixture(scope="class")
+    def path(self, request: pytest.FixtureRequest, repo: Path) -> Path:
+        return repo / "course" / request.cls.notebook
+
+    @pytest.fixture(scope="class")
+    def executed(self, request: pytest.FixtureRequest, path: Path) -> Any:
+        return execute(path, request.cls.claims, request.cls.timeout)
+
+    def test_form(self, path: Path) -> None:
+        check_form(path, self.exercises)
+
+    def test_it_runs_from_the_top_and_says_nothing_on_stderr(self, executed: Any) -> None:
+        check_silent(executed)
+
+    def test_every_figure_and_table_can_be_read_by_everybody(self, executed: Any) -> None:
+        check_readable(executed, self.figures, self.tables)
+
+    def test_open_exercises_are_reported_kindly(self, executed: Any) -> None:
+        check_open_exercises(executed, f"lesson_{self.notebook[:2]}")

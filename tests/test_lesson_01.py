@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 
 import robotbrain.ros  # makes rclpy importable
-from robotbrain.grading import Report
 from tests import lessons
 from tests.lessons import hints
 
@@ -37,37 +36,17 @@ assert straight.reason == "did not arrive within 40 s" and not straight.collisio
 """
 
 
-@pytest.fixture(scope="module")
-def path(repo: Path) -> Path:
-    return repo / "course" / "01_ai_robot_brain.ipynb"
-
-
-@pytest.fixture(scope="module")
-def executed(path: Path) -> Any:
-    return lessons.execute(path, CLAIMS)
-
-
-def test_the_form_of_a_lesson(path: Path) -> None:
-    lessons.check_form(path, exercises="1234")
-
-
-def test_it_runs_from_the_top_and_says_nothing_on_stderr(executed: Any) -> None:
-    lessons.check_silent(executed)
-
-
-def test_every_figure_and_table_can_be_read_by_everybody(executed: Any) -> None:
-    lessons.check_readable(executed, figures=2)
-
-
-def test_open_exercises_are_reported_kindly(executed: Any) -> None:
-    lessons.check_open_exercises(executed, "lesson_01")
+class TestLesson(lessons.LessonTests):
+    notebook = "01_ai_robot_brain.ipynb"
+    exercises = "1234"
+    figures = 2
+    claims = CLAIMS
 
 
 # ---------------------------------------------------------------- the checks
 
 
-def check(exercise: str, **answers: Any) -> Report:
-    return lessons.check("lesson_01", exercise, **answers)
+check = partial(lessons.check, "lesson_01")
 
 
 assert robotbrain.ros.BACKEND == "kit"

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import nbformat
 import pytest
 
-from robotbrain.grading import Report, Verdict, load_suite
+from robotbrain.grading import Verdict, load_suite
 from robotbrain.grading.suites import lesson_02
 from robotbrain.jetson.catalogue import list_modules, load_module
 from robotbrain.jetson.software import load_headlines, load_jetpacks, newest_jetpack
@@ -18,22 +19,10 @@ from robotbrain.jetson.twin.data import load_kernel_lists
 from tests import lessons
 from tests.lessons import hints
 
-NAME = "02_jetson_platforms"
-
 
 @pytest.fixture(scope="module")
-def path(repo: Path) -> Path:
-    return repo / "course" / f"{NAME}.ipynb"
-
-
-@pytest.fixture(scope="module")
-def lesson(path: Path) -> Any:
-    return nbformat.read(path, as_version=4)
-
-
-@pytest.fixture(scope="module")
-def executed(path: Path) -> Any:
-    return lessons.execute(path, CLAIMS)
+def lesson(repo: Path) -> Any:
+    return nbformat.read(repo / "course" / TestLesson.notebook, as_version=4)
 
 
 CLAIMS = """
@@ -60,22 +49,16 @@ assert not traces["passive"].shut_down
 # ---------------------------------------------------------------- the notebook
 
 
-def test_the_form_of_a_lesson(path: Path) -> None:
-    lessons.check_form(path, exercises="123456")
+class TestLesson(lessons.LessonTests):
+    notebook = "02_jetson_platforms.ipynb"
+    exercises = "123456"
+    figures = 6
+    tables = 8
+    claims = CLAIMS
 
-
-def test_it_runs_from_the_top_and_says_nothing_on_stderr(executed: Any) -> None:
-    lessons.check_silent(executed)
-
-
-def test_every_figure_and_table_can_be_read_by_everybody(executed: Any) -> None:
-    lessons.check_readable(executed, figures=6, tables=8)
-    drawings = [tag for tag, _ in lessons.Tags("\n".join(lessons.outputs(executed, "text/html"))).found if tag == "svg"]
-    assert len(drawings) == 2
-
-
-def test_open_exercises_are_reported_kindly(executed: Any) -> None:
-    lessons.check_open_exercises(executed, "lesson_02")
+    def test_the_two_plots_of_the_twin_are_drawn(self, executed: Any) -> None:
+        page = "\n".join(lessons.outputs(executed, "text/html"))
+        assert [tag for tag, _ in lessons.Tags(page).found].count("svg") == 2
 
 
 # ---------------------------------------------------------------- prose against the catalogue
@@ -134,8 +117,7 @@ def test_what_the_prose_says_about_jetpack_agrees_with_the_table() -> None:
 # ---------------------------------------------------------------- the checks
 
 
-def check(exercise: str, **answers: Any) -> Report:
-    return lessons.check("lesson_02", exercise, **answers)
+check = partial(lessons.check, "lesson_02")
 
 
 def fp32_peak_gflops(module: Any, mode: Any) -> float:

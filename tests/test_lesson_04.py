@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import copy
 import math
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import pytest
 
-from robotbrain.grading import Report
 from tests import lessons
 from tests.lessons import hints
 
@@ -25,37 +24,19 @@ assert np.exp(-((0.5 / 0.25) ** 2)) < 0.02
 """
 
 
-@pytest.fixture(scope="module")
-def path(repo: Path) -> Path:
-    return repo / "course" / "04_rl_tasks.ipynb"
-
-
-@pytest.fixture(scope="module")
-def executed(path: Path) -> Any:
-    return lessons.execute(path, CLAIMS, timeout=300)
-
-
-def test_the_form_of_a_lesson(path: Path) -> None:
-    lessons.check_form(path, exercises="1234")
-
-
-def test_it_runs_from_the_top_and_says_nothing_on_stderr(executed: Any) -> None:
-    lessons.check_silent(executed)
-
-
-def test_every_figure_and_table_can_be_read_by_everybody(executed: Any) -> None:
-    lessons.check_readable(executed, figures=4, tables=3)
-
-
-def test_open_exercises_are_reported_kindly(executed: Any) -> None:
-    lessons.check_open_exercises(executed, "lesson_04")
+class TestLesson(lessons.LessonTests):
+    notebook = "04_rl_tasks.ipynb"
+    exercises = "1234"
+    figures = 4
+    tables = 3
+    claims = CLAIMS
+    timeout = 300
 
 
 # ---------------------------------------------------------------- the checks
 
 
-def check(exercise: str, **answers: Any) -> Report:
-    return lessons.check("lesson_04", exercise, **answers)
+check = partial(lessons.check, "lesson_04")
 
 
 def step_reward(

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 
-from robotbrain.grading import Report
 from tests import lessons
 from tests.lessons import hints
 
@@ -25,37 +24,19 @@ assert abs(0.04 / (1 - reach_ddpg_config().gamma) - 0.27) < 0.02 and reach_ddpg_
 """
 
 
-@pytest.fixture(scope="module")
-def path(repo: Path) -> Path:
-    return repo / "course" / "05_ddpg_reach.ipynb"
-
-
-@pytest.fixture(scope="module")
-def executed(path: Path) -> Any:
-    return lessons.execute(path, CLAIMS, timeout=300)
-
-
-def test_the_form_of_a_lesson(path: Path) -> None:
-    lessons.check_form(path, exercises="1234")
-
-
-def test_it_runs_from_the_top_and_says_nothing_on_stderr(executed: Any) -> None:
-    lessons.check_silent(executed)
-
-
-def test_every_figure_and_table_can_be_read_by_everybody(executed: Any) -> None:
-    lessons.check_readable(executed, figures=4, tables=1)
-
-
-def test_open_exercises_are_reported_kindly(executed: Any) -> None:
-    lessons.check_open_exercises(executed, "lesson_05")
+class TestLesson(lessons.LessonTests):
+    notebook = "05_ddpg_reach.ipynb"
+    exercises = "1234"
+    figures = 4
+    tables = 1
+    claims = CLAIMS
+    timeout = 300
 
 
 # ---------------------------------------------------------------- the checks
 
 
-def check(exercise: str, **answers: Any) -> Report:
-    return lessons.check("lesson_05", exercise, **answers)
+check = partial(lessons.check, "lesson_05")
 
 
 def discounted_return(rewards: list[float], gamma: float, terminated: bool, last_value: float) -> float:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.stats import t
 
-from robotbrain.grading import Report
 from tests import lessons
 from tests.lessons import hints
 
@@ -26,37 +25,18 @@ assert max(reach_over_ros([(0.5, 0.3, 0.4), (0.4, -0.3, 0.6)], serial=7)) < 0.02
 """
 
 
-@pytest.fixture(scope="module")
-def path(repo: Path) -> Path:
-    return repo / "course" / "06_sim_to_real.ipynb"
-
-
-@pytest.fixture(scope="module")
-def executed(path: Path) -> Any:
-    return lessons.execute(path, CLAIMS)
-
-
-def test_the_form_of_a_lesson(path: Path) -> None:
-    lessons.check_form(path, exercises="1234")
-
-
-def test_it_runs_from_the_top_and_says_nothing_on_stderr(executed: Any) -> None:
-    lessons.check_silent(executed)
-
-
-def test_every_figure_and_table_can_be_read_by_everybody(executed: Any) -> None:
-    lessons.check_readable(executed, figures=3, tables=1)
-
-
-def test_open_exercises_are_reported_kindly(executed: Any) -> None:
-    lessons.check_open_exercises(executed, "lesson_06")
+class TestLesson(lessons.LessonTests):
+    notebook = "06_sim_to_real.ipynb"
+    exercises = "1234"
+    figures = 3
+    tables = 1
+    claims = CLAIMS
 
 
 # ---------------------------------------------------------------- the checks
 
 
-def check(exercise: str, **answers: Any) -> Report:
-    return lessons.check("lesson_06", exercise, **answers)
+check = partial(lessons.check, "lesson_06")
 
 
 def with_play(motor: list[float], play: float, start: float = 0.0) -> list[float]:

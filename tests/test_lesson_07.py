@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from robotbrain.grading import Report, Verdict
+from robotbrain.grading import Verdict
 from robotbrain.pipeline.patterns.ages import StaleGuard, safe_speed
 from robotbrain.pipeline.patterns.budgets import Task
 from robotbrain.pipeline.patterns.chains import reaction_bound_ns
@@ -97,37 +97,18 @@ assert safe_speed(ages["Nano, one thread"] / 1000, 1.0, 1.0) > safe_speed(ages["
 """
 
 
-@pytest.fixture(scope="module")
-def path(repo: Path) -> Path:
-    return repo / "course" / "07_perception_control.ipynb"
-
-
-@pytest.fixture(scope="module")
-def executed(path: Path) -> Any:
-    return lessons.execute(path, CLAIMS)
-
-
-def test_the_form_of_a_lesson(path: Path) -> None:
-    lessons.check_form(path, exercises="123456")
-
-
-def test_it_runs_from_the_top_and_says_nothing_on_stderr(executed: Any) -> None:
-    lessons.check_silent(executed)
-
-
-def test_every_figure_and_table_can_be_read_by_everybody(executed: Any) -> None:
-    lessons.check_readable(executed, figures=11, tables=7)
-
-
-def test_open_exercises_are_reported_kindly(executed: Any) -> None:
-    lessons.check_open_exercises(executed, "lesson_07")
+class TestLesson(lessons.LessonTests):
+    notebook = "07_perception_control.ipynb"
+    exercises = "123456"
+    figures = 11
+    tables = 7
+    claims = CLAIMS
 
 
 # ---------------------------------------------------------------- right answers
 
 
-def check(exercise: str, **answers: Any) -> Report:
-    return lessons.check("lesson_07", exercise, **answers)
+check = partial(lessons.check, "lesson_07")
 
 
 def pace(steps: Any, camera: float, pipelined: bool) -> tuple[float, float]:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from robotbrain.grading import Report, load_suite
+from robotbrain.grading import load_suite
 from robotbrain.grading.suites import lesson_09
 from tests import lessons
 from tests.lessons import hints
@@ -34,37 +35,19 @@ assert report.is_file() and perfetto.is_file() and accuracy.compared > 50
 """
 
 
-@pytest.fixture(scope="module")
-def path(repo: Path) -> Path:
-    return repo / "course" / "09_monitoring.ipynb"
-
-
-@pytest.fixture(scope="module")
-def executed(path: Path) -> Any:
-    return lessons.execute(path, CLAIMS, timeout=240)
-
-
-def test_the_form_of_a_lesson(path: Path) -> None:
-    lessons.check_form(path, exercises="12345")
-
-
-def test_it_runs_from_the_top_and_says_nothing_on_stderr(executed: Any) -> None:
-    lessons.check_silent(executed)
-
-
-def test_every_figure_and_table_can_be_read_by_everybody(executed: Any) -> None:
-    lessons.check_readable(executed, figures=6, tables=5)
-
-
-def test_open_exercises_are_reported_kindly(executed: Any) -> None:
-    lessons.check_open_exercises(executed, "lesson_09")
+class TestLesson(lessons.LessonTests):
+    notebook = "09_monitoring.ipynb"
+    exercises = "12345"
+    figures = 6
+    tables = 5
+    claims = CLAIMS
+    timeout = 240
 
 
 # ---------------------------------------------------------------- the checks
 
 
-def check(exercise: str, **answers: Any) -> Report:
-    return lessons.check("lesson_09", exercise, **answers)
+check = partial(lessons.check, "lesson_09")
 
 
 def late(times_ms: Any, deadline_ms: float) -> Any:

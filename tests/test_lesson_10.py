@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 
-from robotbrain.grading import Report
 from tests import lessons
 from tests.lessons import hints
 
@@ -76,37 +75,18 @@ with warnings.catch_warnings():
 """
 
 
-@pytest.fixture(scope="module")
-def path(repo: Path) -> Path:
-    return repo / "course" / "10_troubleshooting.ipynb"
-
-
-@pytest.fixture(scope="module")
-def executed(path: Path) -> Any:
-    return lessons.execute(path, CLAIMS)
-
-
-def test_the_form_of_a_lesson(path: Path) -> None:
-    lessons.check_form(path, exercises="123456")
-
-
-def test_it_runs_from_the_top_and_says_nothing_on_stderr(executed: Any) -> None:
-    lessons.check_silent(executed)
-
-
-def test_every_figure_and_table_can_be_read_by_everybody(executed: Any) -> None:
-    lessons.check_readable(executed, figures=6, tables=8)
-
-
-def test_open_exercises_are_reported_kindly(executed: Any) -> None:
-    lessons.check_open_exercises(executed, "lesson_10")
+class TestLesson(lessons.LessonTests):
+    notebook = "10_troubleshooting.ipynb"
+    exercises = "123456"
+    figures = 6
+    tables = 8
+    claims = CLAIMS
 
 
 # ---------------------------------------------------------------- the checks
 
 
-def check(exercise: str, **answers: Any) -> Report:
-    return lessons.check("lesson_10", exercise, **answers)
+check = partial(lessons.check, "lesson_10")
 
 
 def yaw_error(estimated: Any, true: Any) -> Any:
