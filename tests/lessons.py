@@ -140,12 +140,14 @@ class LessonTests:
     timeout: int = 90
 
     @pytest.fixture(scope="class")
-    def path(self, request: pytest.FixtureRequest, repo: Path) -> Path:
-        return repo / "course" / request.cls.notebook
+    @classmethod
+    def path(cls, repo: Path) -> Path:
+        return repo / "course" / cls.notebook
 
     @pytest.fixture(scope="class")
-    def executed(self, request: pytest.FixtureRequest, path: Path) -> Any:
-        return execute(path, request.cls.claims, request.cls.timeout)
+    @classmethod
+    def executed(cls, path: Path) -> Any:
+        return execute(path, cls.claims, cls.timeout)
 
     def test_form(self, path: Path) -> None:
         check_form(path, self.exercises)
