@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint format lab labs train bench profiles proof-drive proof-devices proof-bottlenecks proof-reach proof-velocity proof-gap conformance-ros conformance-isaaclab mutation-test clean
+.PHONY: help install demo test lint format lab labs train bench profiles proof-drive proof-devices proof-bottlenecks proof-reach proof-velocity proof-gap conformance-ros conformance-isaaclab conformance-tensorrt proof-optimisation mutation-test clean
 
 help:  ## Show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-15s %s\n", $$1, $$2}'
@@ -73,6 +73,17 @@ conformance-ros: $(STAMP)  ## Compare the kit with genuine ROS 2 (Linux x86-64; 
 conformance-isaaclab: $(STAMP)  ## Compare the tasks' terms with genuine Isaac Lab 3.0 (downloads its wheel once)
 	$(BIN)/python -m tests.conformance_isaaclab
 
+conformance-tensorrt: $(STAMP)  ## Compare the names the engine uses with the genuine TensorRT bindings (Linux, gcc; downloads 6 MB)
+	$(BIN)/python -m tests.conformance_tensorrt
+
+proof-optimisation: $(STAMP)  ## Students against the teacher over three seeds, QAT, sparsity, the Pareto sweep (about an hour)
+	$(BIN)/python benchmarks/opt_student.py --run-dir build/opt_student
+	$(BIN)/python benchmarks/opt_qat.py
+	$(BIN)/python benchmarks/opt_sparsity.py
+	$(BIN)/python benchmarks/opt_imagenet.py
+	$(BIN)/python benchmarks/opt_precisions.py
+	$(BIN)/python benchmarks/opt_sweep.py
+
 profiles: $(STAMP)  ## Calibrate the Jetson twin and write the reference profiles again
 	$(BIN)/robotbrain jetson calibrate
 	$(BIN)/robotbrain jetson reference
@@ -80,6 +91,7 @@ profiles: $(STAMP)  ## Calibrate the Jetson twin and write the reference profile
 mutation-test: $(STAMP)  ## Test the tests of the labs with named wrong solutions
 	$(BIN)/robotbrain mutation-test lab_integration --jobs 2
 	$(BIN)/robotbrain mutation-test hw1_rl --jobs 2
+	$(BIN)/robotbrain mutation-test hw2_optimisation --jobs 2
 	$(BIN)/robotbrain mutation-test hw3_performance --jobs 2
 
 bench: $(STAMP)  ## Run the benchmarks; each prints one table

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import re
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -18,15 +17,11 @@ import numpy as np
 from robotbrain.jetson.twin.calibrate import CalibrationRun, calibrate
 from robotbrain.jetson.twin.data import LatencyRow, load_latency_rows
 from robotbrain.jetson.twin.fit import Fitted
+from robotbrain.jetson.twin.precisions import architecture_of
 from robotbrain.jetson.twin.validate import MIXED_HARNESSES, Z80, LeftOut, predict_left_out, summarise
 
 HEAD = ("rows", "median", "p90", "within 20 %", "bias", "in 80 %", "baseline", "ratio")
 WIDTHS = (6, 8, 8, 12, 8, 8, 9, 7)
-
-
-def family(row: LatencyRow) -> str:
-    """Return the architecture family of a row's network: its kernel list's name up to the first number or size."""
-    return re.split(r"\d|_", row.kernels)[0]
 
 
 def line(name: str, items: Sequence[LeftOut], scale: float) -> str:
@@ -57,10 +52,10 @@ def families_left_out(fitted: Fitted) -> dict[str, list[LeftOut]]:
     """Leave out whole architecture families, one harness at a time."""
     rows = load_latency_rows()
     result: dict[str, list[LeftOut]] = {}
-    for unit in sorted({(row.harness, family(row)) for row in rows}):
+    for unit in sorted({(row.harness, architecture_of(row)) for row in rows}):
 
         def keep(row: LatencyRow, unit: tuple[str, str] = unit) -> bool:
-            return (row.harness, family(row)) != unit
+            return (row.harness, architecture_of(row)) != unit
 
         result[f"{unit[0]} without {unit[1]}"] = predict_left_out(rows, keep, fitted)
     return result

@@ -36,6 +36,7 @@ COMMANDS: dict[str, Command] = {
     "jetson": Command("robotbrain.jetson.commands:jetson", "what a network takes on a Jetson module: the twin"),
     "rl": Command("robotbrain.rl.commands:rl", "reinforcement learning: tasks, training, evaluation, export"),
     "train": Command("robotbrain.training.commands:train", "train a shipped network again"),
+    "optimise": Command("robotbrain.optimisation.commands:optimise", "quantise, prune and distil a network; a sweep"),
     "grade": Command("robotbrain.grading.commands:grade", "grade one notebook and print the report"),
     "grade-class": Command("robotbrain.grading.commands:grade_class", "grade all submissions of a lab"),
     "generate": Command("robotbrain.grading.commands:generate", "make the students' version of a lab"),

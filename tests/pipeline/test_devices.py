@@ -72,6 +72,15 @@ def test_a_busier_module_draws_more(summaries: dict[str, DeviceSummary]) -> None
     assert watts == sorted(watts) and len(set(watts)) == 4
 
 
+def test_the_summary_is_of_the_precision_that_was_driven_in(summaries: dict[str, DeviceSummary]) -> None:
+    results = summaries[LARGE].results
+    full, half = (
+        summarise(results, dataclasses.replace(detector_deployment(), precision=precision))
+        for precision in ("fp32", "fp16")
+    )
+    assert full.network_ms > 1.2 * half.network_ms == pytest.approx(1.2 * summaries[LARGE].network_ms)
+
+
 def test_runs_of_different_devices_are_not_averaged(summaries: dict[str, DeviceSummary]) -> None:
     mixed = [summaries[SMALL].results[0], summaries[LARGE].results[0]]
     with pytest.raises(InputError, match="one Jetson"):

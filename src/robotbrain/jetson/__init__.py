@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from robotbrain.jetson.catalogue import Module, PowerMode, list_modules, load_module
-    from robotbrain.jetson.engine import OnnxEngine
+    from robotbrain.jetson.engine import InferenceEngine, OnnxEngine, TensorRTEngine, open_engine
     from robotbrain.jetson.graph import analyse
     from robotbrain.jetson.kernels import Kernel, KernelGraph
     from robotbrain.jetson.profiles import JetsonProfile, list_profiles, load_profile
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from robotbrain.jetson.twin import Prediction, compare, predict
 
 __all__ = [
+    "InferenceEngine",
     "JetsonProfile",
     "Kernel",
     "KernelGraph",
@@ -25,6 +26,7 @@ __all__ = [
     "OnnxEngine",
     "PowerMode",
     "Prediction",
+    "TensorRTEngine",
     "analyse",
     "compare",
     "list_modules",
@@ -32,12 +34,13 @@ __all__ = [
     "load_module",
     "load_profile",
     "load_reference",
+    "open_engine",
     "predict",
 ]
 
 _HOMES = {
     "catalogue": ("Module", "PowerMode", "list_modules", "load_module"),
-    "engine": ("OnnxEngine",),
+    "engine": ("InferenceEngine", "OnnxEngine", "TensorRTEngine", "open_engine"),
     "graph": ("analyse",),
     "kernels": ("Kernel", "KernelGraph"),
     "profiles": ("JetsonProfile", "list_profiles", "load_profile"),

@@ -25,6 +25,8 @@ SUBCOMMANDS: dict[str, Subcommand] = {
     "calibrate": Subcommand("calibrate_command", "calibrate", "fit the twin to the published measurements again"),
     "reference": Subcommand("reference", "reference", "make or check the labs' reference numbers"),
     "measure": Subcommand("measure_command", "measure", "measure on a real board, or from its logs"),
+    "deploy": Subcommand("deploy_command", "deploy", "bundle a network for a board: build, check and time it there"),
+    "verify": Subcommand("deploy_command", "verify", "check a bundle offline: every byte, and that its parts fit"),
 }
 
 

@@ -25,7 +25,7 @@ CURRENT = "current"
 
 def measure_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``robotbrain jetson measure``."""
-    parser.add_argument("model", type=Path, metavar="MODEL.onnx", help="the network")
+    parser.add_argument("model", type=Path, nargs="?", metavar="MODEL.onnx", help="the network")
     parser.add_argument(
         "--precision", type=str.lower, choices=PRECISIONS, help="default: fp16 on a board, what a log says with logs"
     )
@@ -52,11 +52,16 @@ def measure_arguments(parser: argparse.ArgumentParser) -> None:
     logs.add_argument("--from-logs", type=Path, metavar="TRTEXEC.log", help="what trtexec printed")
     logs.add_argument("--tegrastats", type=Path, metavar="LOG", help="what tegrastats printed meanwhile")
     logs.add_argument("--jetpack", metavar="VERSION", help="for the profile")
+    logs.add_argument("--from-bundle", type=Path, metavar="RESULT", help="what the program of a bundle wrote back")
 
 
 def measure_main(arguments: argparse.Namespace) -> int:
     """Make a measured profile and say where it is; 130 if interrupted."""
-    if arguments.from_logs is not None:
+    if arguments.from_bundle is not None:
+        profile = _from_bundle(arguments)
+    elif arguments.model is None:
+        raise InputError("MODEL.onnx", given=None, expected="the network", fix="Name its ONNX file.")
+    elif arguments.from_logs is not None:
         profile = _from_logs(arguments)
     else:
         if arguments.tegrastats is not None:
@@ -74,6 +79,28 @@ def measure_main(arguments: argparse.Namespace) -> int:
     if directory.resolve() not in [known.resolve() for known in measured.directories()]:
         print(f"It takes effect where {measured.DIRECTORIES_VARIABLE} names {directory}.")
     return 0
+
+
+def _from_bundle(arguments: argparse.Namespace) -> MeasuredProfile:
+    from robotbrain.jetson.deploy import profile_from_result
+
+    named = {"--from-logs": arguments.from_logs, "--tegrastats": arguments.tegrastats, "--device": arguments.device}
+    if any(value is not None for value in named.values()) or arguments.mode != CURRENT:
+        raise InputError(
+            "robotbrain jetson measure --from-bundle",
+            given="--mode or " + ", ".join(name for name, value in named.items() if value is not None),
+            expected="none of them: the result says",
+            fix="Leave them out.",
+        )
+    profile = profile_from_result(arguments.from_bundle, arguments.source)
+    if arguments.model is not None and Model.from_file(arguments.model).sha256 != profile.sha256:
+        raise InputError(
+            "model",
+            given=str(arguments.model),
+            expected=f"the network that was measured, SHA-256 {profile.sha256[:12]}...",
+            fix="Leave it out, or name the ONNX file that the bundle was made of.",
+        )
+    return profile
 
 
 def _from_logs(arguments: argparse.Namespace) -> MeasuredProfile:

@@ -5,6 +5,7 @@ with Okabe and Ito's colour-blind-safe palette, shapes differing with the colour
 figure shows; :func:`to_html` makes an image with that text for a notebook or a page, :func:`save` writes a file.
 """
 
+from robotbrain.jetson.plot_fusion import plot_fusion
 from robotbrain.jetson.plot_modules import plot_devices, plot_heat
 from robotbrain.jetson.plot_network import plot_prediction, plot_roofline, plot_timeline
 from robotbrain.jetson.plot_style import FORMATS, alt_text, check_format, save, to_html
@@ -14,6 +15,7 @@ __all__ = [
     "alt_text",
     "check_format",
     "plot_devices",
+    "plot_fusion",
     "plot_heat",
     "plot_prediction",
     "plot_roofline",

@@ -4,11 +4,18 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from robotbrain.errors import InputError
+from robotbrain.jetson.kernels import PRECISIONS
+
+if TYPE_CHECKING:
+    from robotbrain.pipeline.deployment import Deployment
 
 
 def _detector(one_thread: bool) -> Any:
@@ -22,6 +29,41 @@ _DEPLOYMENTS: dict[str, Callable[[], Any]] = {
     "detector-one-thread": lambda: _detector(one_thread=True),
     "detector": lambda: _detector(one_thread=False),
 }
+
+
+def _deployment(name: str, network: Path | None, precision: str | None) -> Deployment | None:
+    """Return how the brain is put onto its Jetson; None, the default way, unless something was asked for.
+
+    Raises:
+        InputError: for a network that is none for this robot's camera and classes.
+    """
+    from robotbrain.pipeline.deployment import Deployment
+
+    chosen: Deployment | None = _DEPLOYMENTS[name]()
+    if network is None and precision is None:
+        return chosen
+    chosen = chosen or Deployment()
+    if network is not None:
+        _check_network(network)
+        chosen = replace(chosen, network=None)  # the one that runs is charged for, in every deployment
+    return chosen if precision is None else replace(chosen, precision=precision)
+
+
+def _check_network(path: Path) -> None:
+    from robotbrain.jetson.engine import OnnxEngine
+    from robotbrain.pipeline.segmentation import CLASSES, preprocess
+    from robotbrain.sim.camera import CameraIntrinsics
+
+    camera = CameraIntrinsics.from_fov()
+    answer = OnnxEngine(path).infer(preprocess(np.zeros((camera.height, camera.width, 3), np.uint8)))
+    wanted = (1, len(CLASSES), camera.height, camera.width)
+    if answer.shape != wanted:
+        raise InputError(
+            "--network",
+            given=f"an output of shape {answer.shape}",
+            expected=f"logits {wanted} of the classes {', '.join(CLASSES)}",
+            fix="Give a segmentation network made for this robot (`robotbrain train student`).",
+        )
 
 
 def _p99(values: NDArray[np.float64]) -> str:
@@ -46,6 +88,17 @@ def drive_arguments(parser: argparse.ArgumentParser) -> None:
         default="small",
         help="what is charged for: the simulator's small camera and network, or a 640x480 camera with a network of "
         "ResNet-50's size, with all nodes in one thread or each in a process of its own",
+    )
+    parser.add_argument(
+        "--network",
+        type=Path,
+        metavar="FILE",
+        help="ONNX file of the segmentation network that the brain runs, and whose latency it is charged for",
+    )
+    parser.add_argument(
+        "--precision",
+        choices=PRECISIONS,
+        help="that the network's latency is charged for (default: fp16); what it computes is what its file says",
     )
     parser.add_argument("--html", type=Path, help="write a 3D replay of the last run to this file")
     _ros_arguments(parser.add_argument_group("with --robot ros"))
@@ -118,7 +171,7 @@ def _drive_ros(arguments: argparse.Namespace) -> int:
     return 0 if run.reached else 1
 
 
-SIMULATED_ONLY = ("seeds", "difficulty", "profile", "mode", "deployment", "html")
+SIMULATED_ONLY = ("seeds", "difficulty", "profile", "mode", "deployment", "network", "precision", "html")
 OUTSIDE_ONLY = (
     "transport",
     "address",
@@ -137,8 +190,6 @@ OUTSIDE_ONLY = (
 
 def _refuse_foreign(arguments: argparse.Namespace) -> None:
     """Raise InputError for an option that would be ignored."""
-    from robotbrain.errors import InputError
-
     parser = argparse.ArgumentParser()
     drive_arguments(parser)
     outside = arguments.robot == "ros"
@@ -161,7 +212,6 @@ def drive_main(arguments: argparse.Namespace) -> int:
     _refuse_foreign(arguments)
     if arguments.robot == "ros":
         return _drive_ros(arguments)
-    from robotbrain.errors import InputError
     from robotbrain.pipeline.brain import drive
 
     first, _, last = arguments.seeds.partition(":")
@@ -171,6 +221,7 @@ def drive_main(arguments: argparse.Namespace) -> int:
         seeds = range(0)
     if not seeds or seeds.start < 0:
         raise InputError("--seeds", given=arguments.seeds, expected="a seed or FIRST:END", fix="Try --seeds 0:10.")
+    deployment = _deployment(arguments.deployment, arguments.network, arguments.precision)
     successes = 0
     for seed in seeds:
         run = drive(
@@ -179,7 +230,8 @@ def drive_main(arguments: argparse.Namespace) -> int:
             robot=arguments.robot,
             profile=arguments.profile,
             mode=arguments.mode,
-            deployment=_DEPLOYMENTS[arguments.deployment](),
+            deployment=deployment,
+            model=arguments.network,
         )
         successes += run.success
         print(

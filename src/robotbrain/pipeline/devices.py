@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from robotbrain.errors import InputError
 from robotbrain.jetson.paths import find_part
+from robotbrain.jetson.profiles import PRECISION
 from robotbrain.pipeline.deployment import Deployment
 
 if TYPE_CHECKING:
@@ -81,13 +82,16 @@ class DeviceSummary:
         return self.successes / self.runs
 
 
-def run_power_w(run: RunResult, network: Path, image_size: tuple[int, int] | None = None) -> float:
+def run_power_w(
+    run: RunResult, network: Path, image_size: tuple[int, int] | None = None, precision: str = PRECISION
+) -> float:
     """Return the mean power of the module during a run, W: GPU and memory by the twin, CPU cores on top (assumed).
 
     Args:
         run: with the share of time that each resource was busy.
         network: whose inferences kept the GPU busy.
         image_size: (width, height) of its images, None for the network's own.
+        precision: that it runs in.
     """
     from robotbrain.jetson.catalogue import load_module
     from robotbrain.jetson.resize import at_image_size
@@ -98,7 +102,7 @@ def run_power_w(run: RunResult, network: Path, image_size: tuple[int, int] | Non
     module = load_module(run.profile)
     mode = module.mode(run.power_mode)
     model = network if image_size is None else at_image_size(network, image_size)
-    found = predict(model, module, mode=mode)
+    found = predict(model, module, mode=mode, precision=precision)
     use = found.baseline_ms / found.latency_ms
     cores = run.busy.get("cpu", 0.0) * mode.cpu_online
     gpu_w = load_calibration().power.module_w(module, mode, use, run.busy.get("gpu", 0.0))
@@ -124,7 +128,7 @@ def summarise(runs: Sequence[RunResult], deployment: Deployment | None = None, *
     deployed = deployment or Deployment()
     network = Path(deployed.network or default_model())
     profile = load_profile(slug, mode)
-    power = [run_power_w(run, network, deployed.image_size) for run in runs]
+    power = [run_power_w(run, network, deployed.image_size, deployed.precision) for run in runs]
     energy = sum(watts * run.seconds for watts, run in zip(power, runs, strict=True))
     metres = sum(run.path_length for run in runs)
     latencies = np.concatenate([run.e2e_ms for run in runs])
@@ -135,7 +139,7 @@ def summarise(runs: Sequence[RunResult], deployment: Deployment | None = None, *
         label=label,
         runs=len(runs),
         successes=sum(run.success for run in runs),
-        network_ms=profile.network_ms(network, image_size=deployed.image_size),
+        network_ms=profile.network_ms(network, deployed.precision, deployed.image_size),
         control_hz=float(np.median([run.control_hz for run in runs])),
         e2e_p50_ms=_percentile(latencies, 50),
         e2e_p99_ms=_percentile(latencies, 99),

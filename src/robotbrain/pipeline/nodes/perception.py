@@ -10,7 +10,7 @@ from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from robotbrain.errors import InputError
-from robotbrain.jetson.engine import OnnxEngine
+from robotbrain.jetson.engine import InferenceEngine
 from robotbrain.pipeline.segmentation import (
     CameraModel,
     back_project,
@@ -54,12 +54,14 @@ class PerceptionNode(Node):
     (PointCloud2 in base_link; z is the label). Every output carries the stamp of the image it came from.
 
     Args:
-        engine: runs the network; its latency is charged to simulated time.
+        engine: runs the network; its latency (0 on a board, where time passes by itself) is charged to simulated time.
         mounting: (x, y, z, pitch) of the camera on the base, m and rad.
         queue: images that may wait; the oldest makes way. None: as many as come.
     """
 
-    def __init__(self, engine: OnnxEngine, mounting: tuple[float, float, float, float], queue: int | None = 1) -> None:
+    def __init__(
+        self, engine: InferenceEngine, mounting: tuple[float, float, float, float], queue: int | None = 1
+    ) -> None:
         super().__init__("perception")
         self._engine = engine
         self._mounting = mounting

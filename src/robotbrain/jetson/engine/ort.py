@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robotbrain.errors import InputError
+from robotbrain.jetson.engine.interface import check_input, check_open, example
+from robotbrain.jetson.engine.timing import MEASURED_HERE, TWIN, Latency, check_counts, summarise
 from robotbrain.jetson.profiles import PRECISION, JetsonProfile
+
+if TYPE_CHECKING:
+    from types import TracebackType
 
 
 class OnnxEngine:
@@ -28,6 +34,8 @@ class OnnxEngine:
         path: of the ONNX file.
         profile: as given.
         resource: of the device that an inference occupies: ``charge(engine.latency_ns, engine.resource)``.
+        backend: ``twin`` with a profile (twin-timed), ``onnxruntime`` without.
+        timing: source of ``latency_ns``: ``twin`` with a profile, empty without.
     """
 
     def __init__(
@@ -63,14 +71,24 @@ class OnnxEngine:
                 expected="a valid ONNX file",
                 fix=f"ONNX Runtime says: {str(error).splitlines()[0][:200]}",
             ) from error
+        inputs = self._session.get_inputs()
+        if [value.type for value in inputs] != ["tensor(float)"]:
+            raise InputError(
+                "model",
+                given=f"{path.name} with inputs {[f'{value.name}: {value.type}' for value in inputs]}",
+                expected="a network with one float32 input",
+                fix="Export a network with one float32 image input.",
+            )
         self.path = path
         self.profile = profile
         self.resource = "gpu"
+        self.backend = "onnxruntime" if profile is None else "twin"
+        self.timing = "" if profile is None else TWIN
         self._image_size = image_size
         self._charged_as = path if charged_as is None else Path(charged_as)
         self._precision = precision
         self._latency_ns: int | None = None
-        self._input = self._session.get_inputs()[0]
+        self._input = inputs[0]
         self._output: str = self._session.get_outputs()[0].name
 
     @property
@@ -88,30 +106,64 @@ class OnnxEngine:
             self._latency_ns = round(latency_ms * 1e6)
         return self._latency_ns
 
+    def predicted(self) -> Latency:
+        """Return the profile's latency of one inference, with its source.
+
+        Raises:
+            InputError: without a profile.
+        """
+        if self.profile is None:
+            raise InputError(
+                "profile",
+                given=None,
+                expected="a Jetson profile",
+                fix="Open the engine with profile=load_profile(...).",
+            )
+        milliseconds = self.latency_ns * 1e-6
+        where = f"{self.profile.name} in {self.profile.power_mode}, {self._precision}"
+        return Latency(milliseconds, milliseconds, 0, 1, TWIN, where)
+
     def infer(self, batch: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the network's output for one input.
 
         Raises:
             InputError: for another dtype or shape than the network takes, or values that are not finite.
         """
-        wanted = self.input_shape
-        given = np.asarray(batch)
-        fits = given.ndim == len(wanted) and all(
-            not isinstance(size, int) or size == actual for size, actual in zip(wanted, given.shape, strict=False)
-        )
-        if given.dtype != np.float32 or not fits:
-            raise InputError(
-                "network input",
-                given=f"{given.dtype} {given.shape}",
-                expected=f"float32 {wanted}",
-                fix="Scale to float32, put channels before rows and columns, and add a batch axis.",
-            )
-        if not np.isfinite(given).all():
-            raise InputError(
-                "network input",
-                given="NaN or infinity",
-                expected="finite values",
-                fix="Check the preprocessing.",
-            )
+        check_open(self._session is None, self.path)
+        given = check_input(batch, self.input_shape)
         result: NDArray[np.float32] = self._session.run([self._output], {self._input.name: given})[0]
         return result
+
+    def measure(self, batch: NDArray[np.float32] | None = None, *, runs: int = 50, warmup: int = 10) -> Latency:
+        """Time ``infer`` on this host; with a profile too, for the profile's own latency is :meth:`predicted`.
+
+        Args:
+            batch: what is inferred; None: zeros, open axes of length 1.
+            runs, warmup: timed inferences, and untimed ones before.
+
+        Raises:
+            InputError: for a batch that does not fit, or counts that are too small.
+        """
+        check_counts(runs, warmup)
+        given = example(self.input_shape) if batch is None else batch
+        for _ in range(warmup):
+            self.infer(given)
+        times = []
+        for _ in range(runs):
+            start = time.perf_counter()
+            self.infer(given)
+            times.append((time.perf_counter() - start) * 1e3)
+        harness = "ONNX Runtime on the CPU, one thread, input check included"
+        return summarise(times, batch=len(given), source=MEASURED_HERE, harness=harness)
+
+    def close(self) -> None:
+        """Give the session's memory back."""
+        self._session = None
+
+    def __enter__(self) -> OnnxEngine:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
