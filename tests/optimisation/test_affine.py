@@ -198,6 +198,8 @@ def test_slips_are_told_apart() -> None:
         "scale": lambda: QParams(np.float32(0), np.int32(0), 0, 255),
         "axis": lambda: QParams(np.ones(3, np.float32), np.int32(0), 0, 255),
         "x: got 'an empty": lambda: per_tensor_range([]),
+        "x: got 'words": lambda: quantize("words", choose_qparams(0.0, 1.0)),
+        "x: got \\[\\[1.0": lambda: per_tensor_range([[1.0], [1.0, 2.0]]),
         "axis: got 2": lambda: per_channel_range(np.zeros((2, 2)), 2),
     }.items():
         with pytest.raises(InputError, match="^" + what):

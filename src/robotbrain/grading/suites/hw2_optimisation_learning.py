@@ -1,0 +1,537 @@
+"""How `hw2_optimisation` tests masks, pruning, the distillation loss and the step that uses it."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from robotbrain.grading import expect, expect_close, fail
+from robotbrain.grading.suites import hw2_optimisation_tools as tools
+
+HINTS = {
+    "true-keeps": "True keeps a weight, False prunes it.",
+    "mask-of-bools": "A mask has the shape of the weight and holds truth values (torch.bool).",
+    "small-ones-go": "The weights of smallest MAGNITUDE go: -0.9 is larger than 0.1.",
+    "exactly-so-many": "Exactly round(sparsity * n) weights go, also where several have the same magnitude: sort and "
+    "count instead of comparing with a threshold.",
+    "share-that-goes": "sparsity is the share of zeros: 0.25 keeps three quarters.",
+    "each-tensor-at-once": "The ranking is over the whole tensor, not row by row.",
+    "two-of-four": "In EVERY group of four exactly two weights stay: also where some of them are equal.",
+    "groups-along-inputs": "The four neighbours follow each other along axis 1, the input channels; the last axis of a "
+    "convolution holds its columns.",
+    "larger-two-stay": "Of each four the two of largest magnitude stay.",
+    "weights-only": "Masks are for the weights of convolutions and linear layers. Biases and batch norms are a "
+    "fraction of a per cent of all numbers, and each is worth a whole channel.",
+    "each-layer-its-own": "Each layer loses its own share. One threshold for all of them would empty the layers whose "
+    "weights are small.",
+    "apply-the-mask": "A mask that nobody applies changes nothing: set the weights to zero, in place, under "
+    "`torch.no_grad()`.",
+    "parameters-stay": "Change the values in place (`weight.mul_(mask)`): the optimiser holds THESE parameters.",
+    "mask-after-the-step": "The step moves every weight, zeros included: apply the masks again after it.",
+    "momentum-remembers": "A gradient of zero does not stop Adam: it remembers gradients from before, and so does "
+    "momentum. Mask the WEIGHTS, after the step.",
+    "zero-grad": "Gradients add up until they are cleared: `zero_grad()` before every `backward()`.",
+    "kept-weights-learn": "The weights that stay must go on learning: apply masks to values, not instead of a step.",
+    "t-squared": "The gradient of the KL divergence shrinks with 1 / T^2: multiply the soft term by T^2.",
+    "kl-direction": "KL(teacher || student) = sum p_teacher (log p_teacher - log p_student): the teacher says how much "
+    "each class counts.",
+    "mean-over-pixels": "The soft term is the mean over all positions (N, H, W) of a sum over the classes. "
+    "`reduction='batchmean'` divides by N only, `'mean'` by the classes, too.",
+    "classes-are-axis-1": "The classes lie on axis 1 of (N, 4, H, W): softmax over them, not over columns or rows.",
+    "alpha-is-the-teachers": "alpha is the teacher's share, 1 - alpha that of the labels.",
+    "soften-both": "Both softmaxes are taken at temperature T: the student's and the teacher's.",
+    "hard-at-one": "The cross entropy with the labels is taken of the logits as they are, at temperature 1.",
+    "zero-when-equal": "The KL divergence is 0 where student and teacher agree. A cross entropy is not: it adds the "
+    "teacher's entropy.",
+    "the-hard-term": "There are two terms: the teacher's word, and the labels.",
+    "255-is-no-class": "Pixels labelled 255 have no label: leave them out of the hard term (`ignore_index=255`).",
+    "mean-of-nothing": "Without a single labelled pixel, cross_entropy is 0 / 0, a NaN. There the hard term is 0.",
+    "loss-has-a-gradient": "The loss must still be connected to the student: no detach, item or numpy on its logits.",
+    "teacher-is-a-constant": "The student is to follow the teacher, not the other way round: detach the teacher's "
+    "logits, or compute them under `torch.no_grad()`.",
+    "step-by-step": "zero_grad, backward, step: each of them once. And the loss wants the student's logits first, then "
+    "the teacher's.",
+    "student-in-train": "The student learns, so it is in train mode: batch norm then uses, and follows, the batch.",
+    "every-image-once": "The answer has a row for each image, in the order of the images: mind the last, smaller "
+    "batch.",
+    "logits-not-probabilities": "Return the logits, as they come: the loss divides them by T before its softmax.",
+    "use-what-is-given": "Pass temperature and alpha on to the loss.",
+    "teacher-in-eval": "The teacher is in eval mode: `teacher.eval()`. In train mode its batch norms follow the "
+    "student's batches, and dropout makes it guess.",
+    "loss-as-a-float": "Return the loss as a float (`loss.item()`): a tensor would keep its whole graph in memory.",
+}
+
+# ---------------------------------------------------------------- masks
+
+
+def compare_mask(student: Any, weight: Tensor, sparsity: float, given: str) -> None:
+    """The mask keeps exactly the right number of weights, and none that is smaller than one that goes."""
+    kept_before = weight.clone()
+    mask = _mask(student(weight, sparsity), weight, given)
+    expect(torch.equal(weight, kept_before), "the weights were changed: only a mask was asked for", given=given)
+    size = weight.numel()
+    drop = round(sparsity * size)
+    zeros = int((~mask).sum())
+    big, small = weight.abs()[mask], weight.abs()[~mask]
+    ordered = not len(big) or not len(small) or bool(small.max() <= big.min())
+    if zeros == drop and ordered:
+        return
+    hint = tools.first_match(mask, _mask_mistakes(weight, sparsity, drop), tools.magnitude_mask(weight, sparsity))
+    fail(
+        "the mask prunes other weights than the smallest" if zeros == drop else f"{zeros} of {size} weights go",
+        given=given,
+        got=f"{zeros} go; the largest of them has magnitude {float(small.max()) if len(small) else 0:.4g}, the "
+        f"smallest that stays {float(big.min()) if len(big) else 0:.4g}",
+        expected=f"the {drop} smallest go",
+        hint=hint or ("small-ones-go" if zeros == drop else "exactly-so-many"),
+    )
+
+
+def _mask_mistakes(weight: Tensor, sparsity: float, drop: int) -> list[tuple[str, Tensor]]:
+    rows = torch.stack([tools.magnitude_mask(row, sparsity) for row in weight])
+    signed = tools.magnitude_mask(weight - weight.min(), sparsity)
+    threshold = torch.sort(weight.abs().ravel()).values[min(drop, weight.numel() - 1)]
+    return [
+        ("true-keeps", ~tools.magnitude_mask(weight, sparsity)),
+        ("share-that-goes", tools.magnitude_mask(weight, 1 - sparsity)),
+        ("small-ones-go", signed),
+        ("small-ones-go", ~tools.magnitude_mask(weight, 1 - sparsity)),
+        ("each-tensor-at-once", rows),
+        ("exactly-so-many", weight.abs() > threshold),
+    ]
+
+
+def _mask(answer: Any, weight: Tensor, given: str) -> Tensor:
+    mask = tools.as_tensor(answer, "the mask", tuple(weight.shape), "mask-of-bools")
+    expect(mask.dtype == torch.bool, "the mask should hold truth values", got=str(mask.dtype), expected="torch.bool",
+           given=given, hint="mask-of-bools")  # fmt: skip
+    return mask
+
+
+def compare_two_four(student: Any, weight: Tensor, given: str) -> None:
+    """Of four neighbours along the input channels exactly two stay, the larger ones."""
+    mask = _mask(student(weight), weight, given)
+
+    def groups(tensor: Tensor) -> Tensor:
+        moved = tensor.movedim(1, -1)
+        return moved.reshape(*moved.shape[:-1], -1, 4)
+
+    stay = groups(mask).sum(dim=-1)
+    kept = groups(torch.where(mask, weight.abs(), torch.inf)).amin(dim=-1)
+    gone = groups(torch.where(mask, -torch.inf, weight.abs())).amax(dim=-1)
+    if bool((stay == 2).all()) and bool((gone <= kept).all()):
+        return
+    key = "two-of-four" if not bool((stay == 2).all()) else "larger-two-stay"
+    if key == "larger-two-stay" and bool((kept <= gone).all()):
+        key = "true-keeps"
+    for axis in {0, weight.ndim - 1, weight.ndim - 2} - {1}:
+        if weight.shape[axis] % 4 == 0:
+            elsewhere = mask.movedim(axis, -1)
+            if bool((elsewhere.reshape(*elsewhere.shape[:-1], -1, 4).sum(dim=-1) == 2).all()):
+                key = "groups-along-inputs" if key == "two-of-four" else key
+    if key == "two-of-four" and bool((mask.reshape(-1, 4).sum(dim=-1) == 2).all()):
+        key = "groups-along-inputs"
+    fail("a group of four is not as it should be", given=given,
+         got=f"groups keep {int(stay.min())} to {int(stay.max())} weights", hint=key,
+         expected="each group keeps its two largest")  # fmt: skip
+
+
+# ---------------------------------------------------------------- pruning
+
+
+class Mixed(nn.Module):
+    """Convolutions with and without bias, batch norms, a linear layer: what to prune, and what to leave alone."""
+
+    def __init__(self, seed: int) -> None:
+        super().__init__()
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            self.body = nn.Sequential(
+                nn.Conv2d(3, 8, 3, bias=False), nn.BatchNorm2d(8), nn.ReLU(), nn.Conv2d(8, 12, 1), nn.ReLU()
+            )
+            self.head = nn.Linear(12, 5)
+            with torch.no_grad():
+                self.body[3].weight.mul_(0.1)  # type: ignore[operator]  # layers of different sizes of weights
+                self.body[1].weight.uniform_(0.5, 1.5)  # type: ignore[operator]
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Return (N, 5) for (N, 3, H, W)."""
+        return self.head(self.body(image).mean(dim=(2, 3)))  # type: ignore[no-any-return]
+
+
+def compare_pruned(student: Any, sparsity: float, seed: int) -> None:
+    """After ``prune`` each weight tensor has its own share of zeros, and nothing else has changed."""
+    network = Mixed(seed)
+    before, leaves = tools.state_of(network), dict(network.named_parameters())
+    wanted = list(tools.prunable(network))
+    given = f"a network with convolutions, a batch norm and a linear layer; sparsity = {sparsity:g}"
+    masks = student(network, sparsity)
+    now = dict(network.named_parameters())
+    expect(list(now) == list(leaves) and all(now[n] is leaves[n] for n in leaves), "parameters were replaced",
+           got=list(now), expected=list(leaves), given=given, hint="parameters-stay")  # fmt: skip
+    if not isinstance(masks, Mapping):
+        fail("the answer should be a dict of masks", got=masks, expected='{"body.0.weight": mask, ...}', given=given)
+    others = [n for n in (*masks, *tools.changed(before, network)) if n not in wanted]
+    expect(not others, "other numbers than the weights of convolutions and linear layers are pruned", got=others,
+           expected=wanted, given=given, hint="weights-only")  # fmt: skip
+    missing = [n for n in wanted if n not in masks]
+    expect(not missing, "masks are missing", got=list(masks), expected=wanted, given=given)
+    zeros = {n: int((now[n] == 0).sum()) for n in wanted}
+    drop = {n: round(sparsity * before[n].numel()) for n in wanted}
+    total = sum(drop.values())
+    if zeros != drop:
+        kept = {n: before[n].numel() - k for n, k in drop.items()}
+        untouched = not any(zeros.values())
+        key = "apply-the-mask" if untouched else "true-keeps" if zeros == kept else "each-layer-its-own"
+        alike = untouched or zeros == kept or abs(sum(zeros.values()) - total) <= len(drop)
+        fail("the layers do not have the right number of zeros", got=zeros, expected=drop, given=given,
+             hint=key if alike else "exactly-so-many")  # fmt: skip
+    for name in wanted:
+        mask = _mask(masks[name], before[name], given)
+        expect(torch.equal(now[name], before[name] * mask), f"{name} is not the old weight times its mask", given=given,
+               hint="true-keeps" if torch.equal(now[name], before[name] * ~mask) else "apply-the-mask")  # fmt: skip
+        small, big = before[name].abs()[~mask], before[name].abs()[mask]
+        expect(not len(small) or not len(big) or bool(small.max() <= big.min()), f"{name} lost large weights",
+               given=given, hint="small-ones-go")  # fmt: skip
+
+
+def compare_pruned_steps(student: Any, seed: int, steps: int = 4) -> None:
+    """Zeros stay zeros while the rest learns, also with an optimiser that remembers dense gradients."""
+    for make in (_adam, _momentum):
+        network = Mixed(seed)
+        optimiser = make(network)
+        generator = torch.Generator().manual_seed(seed)
+        images, wanted = torch.randn(12, 3, 5, 5, generator=generator), torch.randn(12, 5, generator=generator)
+
+        def loss_of(net: nn.Module, images: Tensor = images, wanted: Tensor = wanted) -> Tensor:
+            return functional.mse_loss(net(images), wanted)
+
+        for _ in range(3):  # the dense training before
+            optimiser.zero_grad()
+            loss_of(network).backward()  # type: ignore[no-untyped-call]
+            optimiser.step()
+        optimiser.zero_grad()
+        masks = {}
+        with torch.no_grad():
+            for name, weight in tools.prunable(network).items():
+                masks[name] = tools.magnitude_mask(weight, 0.5)
+                weight.mul_(masks[name])
+        runs = {key: _run_steps(network, optimiser, masks, loss_of, make, key, steps) for key in ("", *_STEP_MISTAKES)}
+        given = (
+            f"{type(optimiser).__name__} after three dense steps, then {steps} steps with half of the weights pruned"
+        )
+        for _ in range(steps):
+            student(network, masks, optimiser, loss_of(network))
+            back = {n: int((w[~masks[n]] != 0).sum()) for n, w in tools.prunable(network).items()}
+            if any(back.values()):
+                key = tools.first_match(tools.flat(network), _after(runs, after=1), runs[""][0])
+                fail("pruned weights came back", got=f"{sum(back.values())} pruned weights are not zero",
+                     expected="every pruned weight is 0 after every step", given=given,
+                     hint=key or "mask-after-the-step")  # fmt: skip
+        got, right = tools.flat(network), runs[""][-1]
+        hint = tools.first_match(got, _after(runs, after=steps), right) or "kept-weights-learn"
+        expect_close(got.numpy(), right.numpy(), rtol=1e-3, atol=1e-5, given=given, hint=hint,
+                     what="the network after the steps")  # fmt: skip
+
+
+_STEP_MISTAKES = ("mask-after-the-step", "momentum-remembers", "zero-grad")
+
+
+def _after(runs: Mapping[str, list[Tensor]], after: int) -> list[tuple[str, Any]]:
+    return [(key, runs[key][after - 1]) for key in _STEP_MISTAKES]
+
+
+def _adam(network: nn.Module) -> torch.optim.Optimizer:
+    return torch.optim.Adam(network.parameters(), lr=1e-2)
+
+
+def _momentum(network: nn.Module) -> torch.optim.Optimizer:
+    return torch.optim.SGD(network.parameters(), lr=1e-2, momentum=0.9)
+
+
+def _run_steps(
+    network: nn.Module,
+    optimiser: torch.optim.Optimizer,
+    masks: Mapping[str, Tensor],
+    loss_of: Callable[[nn.Module], Tensor],
+    make: Callable[[nn.Module], torch.optim.Optimizer],
+    mistake: str,
+    steps: int,
+) -> list[Tensor]:
+    """Return the network's numbers after each step, made right or with a mistake, on a copy."""
+    net = copy.deepcopy(network)
+    own = make(net)
+    own.load_state_dict(copy.deepcopy(optimiser.state_dict()))
+    found = []
+    for _ in range(steps):
+        loss = loss_of(net)
+        if mistake != "zero-grad":
+            own.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        weights = tools.prunable(net)
+        if mistake == "momentum-remembers":
+            for name, weight in weights.items():
+                assert weight.grad is not None
+                weight.grad.mul_(masks[name])
+        own.step()
+        if mistake not in ("mask-after-the-step", "momentum-remembers"):
+            with torch.no_grad():
+                for name, weight in weights.items():
+                    weight.mul_(masks[name])
+        found.append(tools.flat(net))
+    return found
+
+
+# ---------------------------------------------------------------- the distillation loss
+
+
+def logits_and_labels(seed: int, shape: tuple[int, ...] = (3, 4, 2, 5), unknown: float = 0.0) -> tuple[Tensor, ...]:
+    """Return logits of student and teacher, float64, and labels, a share ``unknown`` of them 255."""
+    generator = torch.Generator().manual_seed(seed)
+    student = 2 * torch.randn(shape, generator=generator, dtype=torch.float64)
+    teacher = 3 * torch.randn(shape, generator=generator, dtype=torch.float64)
+    labels = torch.randint(0, shape[1], (shape[0], *shape[2:]), generator=generator)
+    labels[torch.rand(labels.shape, generator=generator) < unknown] = tools.IGNORE
+    return student, teacher, labels
+
+
+def compare_loss(
+    student: Any, logits: tuple[Tensor, ...], temperature: float, alpha: float, given: str, rtol: float = 1e-5
+) -> None:
+    """Compare the value with alpha T^2 KL(teacher || student) + (1 - alpha) CE."""
+    z, t, labels = logits
+    expected = tools.distillation_loss(z, t, labels, temperature, alpha)
+    answer = student(z.clone().requires_grad_(True), t.clone(), labels.clone(), temperature=temperature, alpha=alpha)
+    loss = tools.as_tensor(answer, "the loss", (), "mean-over-pixels").detach()
+    hint = tools.first_match(loss, _loss_mistakes(z, t, labels, temperature, alpha), expected)
+    if bool(torch.isnan(loss)) and bool((labels == tools.IGNORE).all()):
+        hint = "mean-of-nothing"
+    expect_close(loss.numpy(), expected.numpy(), rtol=rtol, atol=1e-9, given=given, hint=hint, what="the loss")
+
+
+def _loss_mistakes(z: Tensor, t: Tensor, labels: Tensor, temp: float, alpha: float) -> list[tuple[str, Any]]:
+    def soft(
+        axis: int = 1, reverse: bool = False, student_t: float = temp, teacher_t: float = temp, entropy: bool = True
+    ) -> Tensor:
+        log_q, log_p = (functional.log_softmax(v / k, dim=axis) for v, k in ((z, student_t), (t, teacher_t)))
+        if reverse:
+            log_q, log_p = log_p, log_q
+        value: Tensor = (log_p.exp() * ((log_p if entropy else 0.0) - log_q)).sum(dim=axis).mean()
+        return value
+
+    known = labels != tools.IGNORE
+    some = bool(known.any())
+
+    def cross(scale: float = 1.0) -> Tensor:
+        return functional.cross_entropy(z / scale, labels, ignore_index=tools.IGNORE) if some else torch.zeros(())
+
+    kl, hard, square = soft(), cross(), temp**2
+    positions, batch = z.numel() / z.shape[1], z.shape[0]
+
+    def both(soft_term: Any, hard_term: Any = hard, share: float = alpha) -> Tensor:
+        return torch.as_tensor(share * soft_term + (1 - share) * hard_term)
+
+    clamped = torch.where(known, labels, 0)
+    found = [
+        ("t-squared", both(kl)),
+        ("t-squared", both(temp * kl)),
+        ("t-squared", both(kl / square)),
+        ("t-squared", both(kl, hard) * square),
+        ("kl-direction", both(square * soft(reverse=True))),
+        ("mean-over-pixels", both(square * kl * positions / batch)),
+        ("mean-over-pixels", both(square * kl / z.shape[1])),
+        ("mean-over-pixels", both(square * kl * positions)),
+        ("alpha-is-the-teachers", both(square * kl, hard, 1 - alpha)),
+        ("soften-both", both(square * soft(student_t=1.0))),
+        ("soften-both", both(square * soft(teacher_t=1.0))),
+        ("soften-both", both(square * soft(student_t=1.0, teacher_t=1.0))),
+        ("soften-both", both(soft(student_t=1.0, teacher_t=1.0))),
+        ("hard-at-one", both(square * kl, cross(temp))),
+        ("hard-at-one", both(square * kl, square * cross(temp))),
+        ("zero-when-equal", both(square * soft(entropy=False))),
+        ("zero-when-equal", both(soft(entropy=False))),
+        ("zero-when-equal", square * soft(entropy=False)),
+        ("zero-when-equal", soft(entropy=False)),
+        ("the-hard-term", square * kl),
+        ("the-hard-term", alpha * square * kl),
+        ("the-hard-term", square * kl + hard),
+        ("255-is-no-class", both(square * kl, functional.cross_entropy(z, clamped))),
+        ("255-is-no-class", both(square * kl, hard * known.double().mean())),
+    ]
+    for axis in {0, z.ndim - 1, z.ndim - 2, 2} - {1}:
+        if axis < z.ndim:
+            wrong = soft(axis)
+            found.append(("classes-are-axis-1", both(square * wrong)))
+            mixed = functional.softmax(t / temp, dim=axis)
+            logs = functional.log_softmax(z / temp, dim=axis)
+            each = functional.kl_div(logs, mixed, reduction="none").sum(dim=1).mean()
+            found.append(("classes-are-axis-1", both(square * each)))
+    return found
+
+
+def compare_loss_gradient(student: Any, seed: int) -> None:
+    """The gradient is the derivative (central differences); none reaches the teacher."""
+    z, t, labels = logits_and_labels(seed, (2, 4, 1, 3))
+    z, t = z.requires_grad_(True), t.requires_grad_(True)
+    loss = tools.as_tensor(student(z, t, labels, temperature=3.0, alpha=0.6), "the loss", (), "mean-over-pixels")
+    expect(loss.requires_grad, "the loss is cut off from the student: nothing can be learned from it",
+           hint="loss-has-a-gradient")  # fmt: skip
+    loss.backward()  # type: ignore[no-untyped-call]
+    expect(z.grad is not None, "no gradient reaches the student's logits", hint="loss-has-a-gradient")
+    expect(t.grad is None or not bool(t.grad.any()), "a gradient reaches the teacher's logits", got=t.grad,
+           expected="none", hint="teacher-is-a-constant")  # fmt: skip
+    with torch.no_grad():
+        probe = z.detach().clone()
+        slope = torch.zeros_like(probe)
+        for k in range(probe.numel()):
+            for sign in (1, -1):
+                probe.view(-1)[k] += sign * 1e-5
+                slope.view(-1)[k] += sign * float(tools.distillation_loss(probe, t, labels, 3.0, 0.6)) / 2e-5
+                probe.view(-1)[k] -= sign * 1e-5
+    assert z.grad is not None
+    expect_close(z.grad.numpy(), slope.numpy(), rtol=1e-3, atol=1e-6, what="the gradient by the student's logits",
+                 hint=_gradient_hint(z, t, labels, z.grad, slope))  # fmt: skip
+
+
+def _gradient_hint(z: Tensor, t: Tensor, labels: Tensor, got: Tensor, slope: Tensor) -> str:
+    mistakes = []
+    for key, value in _loss_mistakes(z, t.detach(), labels, 3.0, 0.6):
+        if value.requires_grad:
+            mistakes.append((key, torch.autograd.grad(value, z, retain_graph=True)[0]))
+    return tools.first_match(got, mistakes, slope) or "loss-has-a-gradient"
+
+
+def check_temperature(student: Any, seed: int) -> None:
+    """At high temperature the soft gradient is (z - v) / (C n), z and v centred: it no longer depends on T."""
+    z, t, labels = logits_and_labels(seed, (4, 4, 3, 2))
+    limit = ((z - z.mean(dim=1, keepdim=True)) - (t - t.mean(dim=1, keepdim=True))) / 4 / (4 * 3 * 2)
+    for temperature in (1e3, 1e4):
+        leaf = z.clone().requires_grad_(True)
+        loss = tools.as_tensor(student(leaf, t, labels, temperature=temperature, alpha=1.0), "the loss", ())
+        expect(loss.requires_grad, "the loss is cut off from the student", hint="loss-has-a-gradient")
+        loss.backward()  # type: ignore[no-untyped-call]
+        assert leaf.grad is not None
+        got, norm = leaf.grad, float(limit.norm())
+        ratio = float((got * limit).sum()) / norm**2
+        alike = float((got - ratio * limit).norm()) <= 0.02 * abs(ratio) * norm
+        powers = [temperature**p for p in (-3, -2, -1, 1)]
+        hint = "t-squared" if alike and any(abs(ratio / p - 1) < 0.05 for p in powers) else ""
+        hint = hint or ("mean-over-pixels" if alike and abs(ratio - 1) > 0.05 else "")
+        expect(alike and abs(ratio - 1) < 0.02, "the soft gradient depends on the temperature", hint=hint,
+               given=f"alpha = 1, T = {temperature:g}", got=f"{ratio:.3g} times that of the limit",
+               expected="for large T, (z - v) / 4 per pixel, whatever T is (Hinton et al., 2015, section 2.1)",
+               misconception="")  # fmt: skip
+
+
+# ---------------------------------------------------------------- the teacher is asked
+
+
+def compare_asked(student: Any, seed: int, count: int) -> None:
+    """The answers are those of the teacher in eval mode, without a graph; the teacher is the same afterwards."""
+    teacher = tools.small_network(seed, 6, dropout=0.2).train()  # a teacher that nobody has put into eval mode yet
+    with torch.no_grad():
+        norm = teacher.get_submodule("1")
+        assert isinstance(norm, nn.BatchNorm2d)
+        norm.num_batches_tracked.fill_(7)  # type: ignore[union-attr]
+    before = tools.state_of(teacher)
+    inputs = torch.from_numpy(tools.small_scenes(np.random.default_rng(seed), count).inputs())
+    expected = np.concatenate(tools.outputs_of(teacher, inputs.numpy(), ["4"])["4"])
+    given = f"a teacher in train mode, with batch norm and dropout, and {count} images"
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        answer = tools.as_tensor(student(teacher, inputs.clone()), "the answer", expected.shape, "every-image-once")
+    moved = tools.changed(before, teacher)
+    expect(not moved, "the teacher changed", got=", ".join(moved), expected="the teacher it was", given=given,
+           hint="teacher-in-eval" if all("1." in n for n in moved) else "teacher-is-a-constant")  # fmt: skip
+    expect(not answer.requires_grad, "the answers carry the teacher's graph", got="requires_grad=True", given=given,
+           expected="requires_grad=False", hint="teacher-is-a-constant")  # fmt: skip
+    soft = torch.from_numpy(expected).softmax(dim=1)
+    mistakes: list[tuple[str, Any]] = [("logits-not-probabilities", soft), ("logits-not-probabilities", soft.log())]
+    hint = tools.first_match(answer, mistakes, expected) or "teacher-in-eval"
+    expect_close(answer.numpy(), expected, rtol=1e-3, atol=1e-4, given=given, hint=hint, what="the teacher's logits")
+
+
+# ---------------------------------------------------------------- the step
+
+
+@dataclass(frozen=True)
+class Step:
+    """How a step is made; each change is a mistake that students make."""
+
+    zero_grad: bool = True
+    train: bool = True
+    temperature: float | None = None
+    alpha: float | None = None
+    moves: bool = True
+
+    def __call__(
+        self,
+        student: nn.Module,
+        optimiser: torch.optim.Optimizer,
+        images: Tensor,
+        labels: Tensor,
+        wanted: Tensor,
+        temperature: float = 4.0,
+        alpha: float = 0.7,
+    ) -> float:
+        """Make one step and return the loss."""
+        student.train(self.train)
+        share = alpha if self.alpha is None else self.alpha
+        loss = tools.distillation_loss(student(images), wanted, labels, self.temperature or temperature, share)
+        if self.zero_grad:
+            optimiser.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        if self.moves:
+            optimiser.step()
+        return loss.item()
+
+
+STEP_VARIANTS = (
+    ("zero-grad", Step(zero_grad=False)),
+    ("student-in-train", Step(train=False)),
+    ("use-what-is-given", Step(temperature=4.0)),
+    ("use-what-is-given", Step(alpha=0.7)),
+    ("use-what-is-given", Step(temperature=4.0, alpha=0.7)),
+    ("the-hard-term", Step(alpha=1.0)),
+    ("use-what-is-given", Step(alpha=0.0)),
+    ("step-by-step", Step(moves=False)),
+)
+
+
+def compare_steps(distil_step: Any, seed: int, steps: int = 3) -> None:
+    """After some steps the student is where it should be."""
+    pupil = tools.small_network(seed + 1, 4).eval()
+    rng = np.random.default_rng(seed)
+    batches = [tools.small_scenes(rng, 5) for _ in range(steps)]
+    wanted = [torch.from_numpy(rng.normal(0, 2, (5, 4, 8, 8)).astype(np.float32)) for _ in range(steps)]
+    temperature, alpha = 2.5, 0.4
+
+    def run(step: Any) -> tuple[nn.Module, list[Any]]:
+        learner = copy.deepcopy(pupil)
+        optimiser = torch.optim.SGD(learner.parameters(), lr=0.05)
+        losses = [
+            step(learner, optimiser, torch.from_numpy(batch.inputs()),
+                 torch.from_numpy(batch.labels.astype(np.int64)), says.clone(), temperature=temperature, alpha=alpha)
+            for batch, says in zip(batches, wanted, strict=True)
+        ]  # fmt: skip
+        return learner, losses
+
+    given = f"a student with batch norms; {steps} steps of SGD, temperature={temperature}, alpha={alpha}"
+    right, expected = run(Step())
+    learner, losses = run(distil_step)
+    got = tools.flat(learner)
+    mistakes = [(key, tools.flat(run(step)[0])) for key, step in STEP_VARIANTS]
+    hint = tools.first_match(got, mistakes, tools.flat(right), rtol=1e-3) or "step-by-step"
+    expect_close(got.numpy(), tools.flat(right).numpy(), rtol=1e-3, atol=1e-5, given=given, hint=hint,
+                 what="the student after the steps")  # fmt: skip
+    if any(isinstance(v, Tensor) for v in losses):
+        fail("the loss should be a float", got=type(losses[0]).__name__, expected="a float", hint="loss-as-a-float",
+             credit=0.5)  # fmt: skip
+    expect_close(losses, expected, rtol=1e-3, given=given, what="the losses", hint="loss-as-a-float")

@@ -1,0 +1,326 @@
+"""How `hw2_optimisation` reads a submitted network: as data from a stranger.
+
+Before ONNX Runtime or the twin sees the file it is parsed here, and refused unless it is small, refers to no other
+file, holds only stateless arithmetic without loops, and costs little for one image. It runs in the sandboxed process
+that grades the notebook.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from math import prod
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from robotbrain.errors import InputError
+from robotbrain.grading import expect, fail
+from robotbrain.grading.suites.hw2_optimisation_tools import Array
+from robotbrain.rl.onnx_policy import read_limited
+
+MAX_BYTES = 16 * 2**20
+"""Four times the teacher: what is merely too large for the budget is told so by its own test."""
+MAX_NODES = 1000
+BATCH = 10
+"""Images that are handed to the network at once."""
+MAX_ELEMENTS = 4_000_000
+"""Numbers in any tensor, for ``BATCH`` images."""
+MAX_WRITTEN = 60_000_000
+"""Numbers in the outputs of all nodes together, for ``BATCH`` images."""
+MAX_WORK = 5_000_000_000
+"""Multiply-adds and numbers read or written for ``BATCH`` images: some five times the teacher's."""
+OPSETS = range(13, 22)
+SIZE = 64
+QUANTISERS = ("QuantizeLinear", "DequantizeLinear")
+
+# fmt: off
+ALLOWED_OPS = frozenset((
+    "Add", "AveragePool", "BatchNormalization", "Cast", "Clip", "Concat", "Constant", "Conv", "ConvTranspose",
+    "DepthToSpace", "DequantizeLinear", "Div", "Elu", "Flatten", "Gather", "Gemm", "GlobalAveragePool", "HardSigmoid",
+    "HardSwish", "Identity", "LeakyRelu", "MatMul", "Max", "MaxPool", "Min", "Mul", "Neg", "PRelu", "Pad",
+    "QuantizeLinear", "ReduceMean", "Relu", "Reshape", "Resize", "Shape", "Sigmoid", "Slice", "Softmax",
+    "SpaceToDepth", "Split", "Sqrt", "Squeeze", "Sub", "Tanh", "Transpose", "Unsqueeze",
+))
+# fmt: on
+"""Operators that a segmentation network needs: no control flow, no state, no random numbers, no library of its own."""
+
+HINTS = {
+    "file-beside-the-notebook": "The file must lie beside the notebook, under the name that the notebook gives it, and "
+    "be handed in with it.",
+    "not-a-network": "This file cannot be used as it is. Make it with `export_onnx` and `quantise_onnx`, and look at "
+    "it before you hand it in: `onnx.checker.check_model`.",
+    "image-in-logits-out": "The network takes normalised images (N, 3, 64, 64) and returns logits (N, 4, 64, 64), "
+    "float32, N open: as `export_onnx` writes it.",
+    "numbers-are-finite": "A network that answers NaN or infinity has diverged, or has a scale of 0.",
+    "each-image-alone": "The answer to an image must not depend on the others in the batch: was the network exported "
+    "in eval mode?",
+    "train-your-own": "This is a network that the kit ships. Train one of your own: build_student, and your "
+    "distil_step.",
+}
+
+
+@dataclass(frozen=True)
+class Network:
+    """A submitted network that keeps within the limits.
+
+    Attributes:
+        path: of the file.
+        size_bytes: of the file.
+        model: the parsed ``onnx.ModelProto``.
+        session: ONNX Runtime's, which computes the graph as it is written.
+    """
+
+    path: Path
+    size_bytes: int
+    model: Any
+    session: Any
+
+    @property
+    def quantised(self) -> bool:
+        """Whether there are Q/DQ nodes in it."""
+        return any(node.op_type in QUANTISERS for node in self.model.graph.node)
+
+    def logits(self, inputs: Array) -> Array:
+        """Return (N, 4, 64, 64) for (N, 3, 64, 64)."""
+        name = self.session.get_inputs()[0].name
+        rows = 1 if isinstance(self.session.get_inputs()[0].shape[0], int) else BATCH
+        parts = [self.session.run(None, {name: inputs[i : i + rows]})[0] for i in range(0, len(inputs), rows)]
+        return np.concatenate(parts)
+
+
+def load(name: Any) -> Network:
+    """Return the network in the file ``name`` beside the notebook, or fail and say what it is instead."""
+    if not isinstance(name, str) or Path(name).name != name:
+        fail("the name of the file should be a plain file name", got=name, expected='"student_int8.onnx"',
+             hint="file-beside-the-notebook")  # fmt: skip
+    if not Path(name).is_file():
+        fail(f"there is no file {name} beside the notebook", hint="file-beside-the-notebook")
+    try:
+        data = read_limited(Path(name), MAX_BYTES)
+        model = checked_model(data)
+        session = _session(data)
+    except InputError as error:
+        fail(f"{name} cannot be used: {error.what}", got=error.given, expected=error.expected, hint="not-a-network")
+        raise  # for the type checker: fail always raises
+    network = Network(Path(name), len(data), model, session)
+    _check_shapes(network)
+    return network
+
+
+def checked_model(data: bytes) -> Any:
+    """Parse a file's bytes and return the ``onnx.ModelProto`` if it keeps within this module's limits.
+
+    Raises:
+        InputError: otherwise.
+    """
+    import onnx
+
+    model = onnx.ModelProto()
+    try:
+        model.ParseFromString(data)
+    except Exception as error:  # protobuf's implementations raise classes of their own
+        raise _refuse("the file", f"{len(data)} bytes that do not parse", "an ONNX file") from error
+    graph = model.graph
+    versions = {entry.domain: entry.version for entry in model.opset_import}
+    version = versions.get("", versions.get("ai.onnx"))
+    if version not in OPSETS:
+        raise _refuse("its opset", version, f"{OPSETS[0]} to {OPSETS[-1]}")
+    if not 1 <= len(graph.node) <= MAX_NODES:
+        raise _refuse("its nodes", len(graph.node), f"1 to {MAX_NODES}")
+    for node in graph.node:
+        if node.domain not in ("", "ai.onnx") or node.op_type not in ALLOWED_OPS:
+            given = f"{node.domain}::{node.op_type}" if node.domain else node.op_type
+            raise _refuse("one of its operators", given, "one of " + ", ".join(sorted(ALLOWED_OPS)))
+        for attribute in node.attribute:
+            if attribute.HasField("g") or attribute.graphs or attribute.ref_attr_name:
+                raise _refuse("one of its operators", f"{node.op_type} with a graph inside", "plain arithmetic")
+            if attribute.HasField("sparse_tensor") or attribute.sparse_tensors:
+                raise _refuse("its weights", "sparse tensors", "dense ones")
+    if model.functions or model.training_info or graph.sparse_initializer:
+        raise _refuse("the file", "functions, training information or sparse weights", "one plain graph")
+    for tensor in _tensors(graph):
+        if tensor.external_data or tensor.data_location == onnx.TensorProto.EXTERNAL:
+            raise _refuse("its weights", "weights in another file", "weights inside")
+        if any(d < 0 for d in tensor.dims) or prod(tensor.dims) > MAX_ELEMENTS:
+            raise _refuse("its weights", tuple(tensor.dims), f"at most {MAX_ELEMENTS} numbers in a tensor")
+    try:
+        onnx.checker.check_model(model)
+    except Exception as error:  # the C++ side raises several kinds
+        raise _refuse("the graph", _first_line(error), "a valid ONNX graph") from error
+    _check_work(model)
+    return model
+
+
+def _tensors(graph: Any) -> Iterator[Any]:
+    yield from graph.initializer
+    for node in graph.node:
+        for attribute in node.attribute:
+            if attribute.HasField("t"):
+                yield attribute.t
+            yield from attribute.tensors
+
+
+def _check_work(model: Any) -> None:
+    """Refuse what needs much time or memory: a resize can make a small file ask for terabytes."""
+    import onnx
+
+    one = onnx.ModelProto()
+    one.CopyFrom(model)
+    del one.graph.value_info[:]  # the file's own claims
+    for end in (*one.graph.input, *one.graph.output):
+        batch = end.type.tensor_type.shape.dim[:1]
+        if batch and not batch[0].HasField("dim_value"):
+            batch[0].dim_value = BATCH
+    try:
+        graph = onnx.shape_inference.infer_shapes(one, check_type=True, strict_mode=True, data_prop=True).graph
+    except Exception as error:  # the C++ side raises several kinds
+        raise _refuse("the graph", _first_line(error), "shapes that fit") from error
+    shapes: dict[str, tuple[int, ...]] = {t.name: tuple(t.dims) for t in graph.initializer}
+    whole = set()
+    for value in (*graph.input, *graph.value_info, *graph.output):
+        if value.type.tensor_type.elem_type in (onnx.TensorProto.INT32, onnx.TensorProto.INT64):
+            whole.add(value.name)
+        dims = value.type.tensor_type.shape.dim
+        if all(d.HasField("dim_value") for d in dims):
+            shapes[value.name] = tuple(d.dim_value for d in dims)
+    work = written = 0
+    for node in graph.node:
+        if node.op_type == "Div" and whole.intersection(node.output):
+            # A division of integers by zero ends the process.
+            raise _refuse("one of its operators", "Div of integers", "Div of floating-point numbers")
+        for name in filter(None, node.output):
+            if name not in shapes:
+                raise _refuse("the graph", f"{node.op_type} of unknown size", "sizes that follow from the image's")
+            size = prod(shapes[name])
+            if size > MAX_ELEMENTS:
+                raise _refuse("the graph", f"{node.op_type} of shape {shapes[name]}", f"at most {MAX_ELEMENTS} numbers")
+            written += size
+            work += size * _terms(node, shapes)
+    if written > MAX_WRITTEN or work > MAX_WORK:
+        given = f"{work / 1e6 / BATCH:.0f} million operations and {written // BATCH} numbers for one image"
+        raise _refuse("its cost", given, f"at most {MAX_WORK / 1e6 / BATCH:.0f} million and {MAX_WRITTEN // BATCH}")
+
+
+def _terms(node: Any, shapes: dict[str, tuple[int, ...]]) -> int:
+    """Return an upper bound of the multiply-adds for one number of the node's output."""
+    if node.op_type in ("Conv", "ConvTranspose"):
+        return max(1, prod(shapes.get(node.input[1], ())[1:]))
+    if node.op_type in ("MatMul", "Gemm"):
+        return max(shapes.get(node.input[0], (1,)), default=1)
+    if node.op_type in ("MaxPool", "AveragePool"):
+        return prod(next((tuple(a.ints) for a in node.attribute if a.name == "kernel_shape"), (1,)))
+    return 1
+
+
+def _session(data: bytes) -> Any:
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.use_deterministic_compute = True
+    options.log_severity_level = 4
+    # As it is written, Q/DQ pairs around float operators: fused integer kernels saturate on some CPUs, this does not.
+    options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
+    try:
+        return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # ONNX Runtime raises a family of its own, without a common public base
+        raise _refuse("the network", _first_line(error), "a network that ONNX Runtime takes") from error
+
+
+def session_of(model: Any) -> Any:
+    """Return a session for a model that :func:`checked_model` has passed, or that was made from one."""
+    return _session(model.SerializeToString())
+
+
+def _check_shapes(network: Network) -> None:
+    """Fail unless images go in and logits come out, finite, each image by itself."""
+    import onnx
+
+    weights = {tensor.name for tensor in network.model.graph.initializer}
+    for what, ends, channels in (
+        ("input", [i for i in network.model.graph.input if i.name not in weights], 3),
+        ("output", list(network.model.graph.output), 4),
+    ):
+        wanted = f"one float32 {what}, ('batch', {channels}, {SIZE}, {SIZE})"
+        shapes = [tuple(d.dim_value or d.dim_param or "?" for d in end.type.tensor_type.shape.dim) for end in ends]
+        kinds = {end.type.tensor_type.elem_type for end in ends}
+        good = len(ends) == 1 and kinds == {onnx.TensorProto.FLOAT} and len(shapes[0]) == 4
+        fixed = good and isinstance(shapes[0][0], int) and shapes[0][0] != 1
+        if what == "input":
+            good = good and shapes[0][1:] == (channels, SIZE, SIZE)
+        expect(good and not fixed, f"the network's {what} is not as it should be", got=shapes or "none",
+               expected=wanted, hint="image-in-logits-out")  # fmt: skip
+    images = np.random.default_rng(0).normal(0, 1, (3, 3, SIZE, SIZE)).astype(np.float32)
+    try:
+        together = network.logits(images)
+        alone = np.concatenate([network.logits(images[i : i + 1]) for i in range(3)])
+    except Exception as error:  # ONNX Runtime raises a family of its own
+        fail(f"the network does not run: {_first_line(error)}", hint="not-a-network")
+    expect(together.shape == (3, 4, SIZE, SIZE), "the network's output is not as it should be", got=together.shape,
+           given="three images", expected=(3, 4, SIZE, SIZE), hint="image-in-logits-out")  # fmt: skip
+    expect(bool(np.isfinite(together).all()), "the network answers NaN or infinity", given="three images of noise",
+           hint="numbers-are-finite")  # fmt: skip
+    apart = float(np.abs(together - alone).max())
+    expect(apart <= 1e-3 * max(1.0, float(np.abs(alone).max())), "the answer depends on the other images of the batch",
+           got=f"logits differ by {apart:.3g}", expected="each image by itself", hint="each-image-alone")  # fmt: skip
+
+
+# ---------------------------------------------------------------- whose network is it?
+
+
+def conv_weights(model: Any) -> list[Array]:
+    """Return the weights of all convolutions in order, seen through Q/DQ pairs."""
+    from onnx import numpy_helper
+
+    stored = {t.name: t for t in model.graph.initializer}
+    made = {name: node for node in model.graph.node for name in node.output}
+    found = []
+    for node in model.graph.node:
+        if node.op_type != "Conv":
+            continue
+        name, scale = node.input[1], None
+        while name not in stored and name in made and made[name].op_type in (*QUANTISERS, "Identity"):
+            inner = made[name]
+            if inner.op_type == "DequantizeLinear" and inner.input[1] in stored:
+                scale = numpy_helper.to_array(stored[inner.input[1]])
+            name = inner.input[0]
+        if name in stored:
+            weight = numpy_helper.to_array(stored[name])
+            if weight.dtype.kind in "iu" and scale is not None:
+                weight = weight * scale.reshape(-1, *(1,) * (weight.ndim - 1))
+            found.append(np.asarray(weight, dtype=float))
+    return found
+
+
+def check_own(network: Network) -> None:
+    """Fail if these are the weights of a network that the kit ships."""
+    import onnx
+
+    from robotbrain.optimisation.networks import network_path
+
+    mine = conv_weights(network.model)
+    for name in ("student", "student_plain", "teacher"):
+        path = network_path(name)
+        if not path.is_file():
+            continue
+        theirs = conv_weights(onnx.load(str(path)))
+        if [w.shape for w in mine] != [w.shape for w in theirs]:
+            continue
+        same = sum(_cosine(a, b) > 0.98 for a, b in zip(mine, theirs, strict=True))
+        expect(same < 0.8 * len(mine), f"this is the kit's {name}", given=f"{network.path.name}, {len(mine)} layers",
+               got=f"{same} of them are the kit's, up to rounding", hint="train-your-own")  # fmt: skip
+
+
+def _cosine(a: Array, b: Array) -> float:
+    return float((a * b).sum() / max(1e-12, np.linalg.norm(a) * np.linalg.norm(b)))
+
+
+def _refuse(what: str, given: object, expected: str) -> InputError:
+    return InputError(what, given=given, expected=expected, fix="Export the network again with export_onnx.")
+
+
+def _first_line(error: Exception) -> str:
+    lines = str(error).splitlines()
+    return lines[0][:200] if lines else type(error).__name__

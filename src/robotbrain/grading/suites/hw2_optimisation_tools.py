@@ -1,0 +1,263 @@
+"""What the tests of `hw2_optimisation` share: small networks and scenes, and our own answers.
+
+The answers stand in for a part of the student's that is not right yet, so that what builds on it can still be graded.
+They are independent of `robotbrain.optimisation`, whose functions tests/test_hw2_optimisation.py compares them with.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional
+
+from robotbrain.grading import expect, fail
+
+torch.optim.Adam([torch.zeros(1, requires_grad=True)])  # the first optimiser loads for seconds: now, not in a check
+
+Array = NDArray[Any]
+IGNORE = 255
+"""Label of a pixel that nobody has labelled."""
+CLASSES = 4
+
+
+class SmallScenes(NamedTuple):
+    """What `robotbrain.optimisation.data.Scenes` looks like, of any image size."""
+
+    images: NDArray[np.uint8]
+    labels: NDArray[np.uint8]
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def inputs(self) -> NDArray[np.float32]:
+        """Return the network's input (N, 3, H, W), normalised."""
+        from robotbrain.pipeline.segmentation import normalise
+
+        return normalise(self.images)
+
+
+def first_match(answer: Any, mistakes: Sequence[tuple[str, Any]], expected: Any, rtol: float = 1e-4) -> str:
+    """Return the hint of the first mistake that gives ``answer`` and not ``expected``, or ''."""
+    given = _numbers(answer)
+    if given is None:
+        return ""
+    right = np.asarray(expected, dtype=float)
+    for hint, wrong in mistakes:
+        value = _numbers(wrong)
+        if value is None or value.shape != given.shape:
+            continue
+        if value.shape == right.shape and np.allclose(value, right, rtol=rtol, atol=1e-9, equal_nan=True):
+            continue
+        if np.allclose(given, value, rtol=rtol, atol=1e-7, equal_nan=True):
+            return hint
+    return ""
+
+
+def _numbers(value: Any) -> Array | None:
+    try:
+        return np.asarray(value.detach() if isinstance(value, Tensor) else value, dtype=float)
+    except (TypeError, ValueError):
+        return None
+
+
+def as_tensor(answer: Any, what: str, shape: tuple[int, ...], hint: str = "") -> Tensor:
+    """Return the student's answer if it is a tensor of this shape, or fail and say what it is."""
+    if not isinstance(answer, Tensor):
+        fail(f"{what} should be a torch tensor, but is of type {type(answer).__name__}", got=answer,
+             expected=f"a tensor of shape {shape}", hint=hint)  # fmt: skip
+    if tuple(answer.shape) != shape:
+        fail(f"{what} has shape {tuple(answer.shape)}, but shape {shape} is expected", got=tuple(answer.shape),
+             expected=shape, hint=hint)  # fmt: skip
+    tensor: Tensor = answer
+    return tensor
+
+
+# ---------------------------------------------------------------- small networks and scenes
+
+
+def small_network(seed: int, width: int = 4, dropout: float = 0.0) -> nn.Sequential:
+    """Return a network of every kind of layer that a mask or a mode could forget; (N, 3, H, W) to (N, 4, H, W)."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        network = nn.Sequential(
+            nn.Conv2d(3, width, 3, padding=1),
+            nn.BatchNorm2d(width),
+            nn.ReLU(),
+            nn.Dropout(dropout),
+            nn.Conv2d(width, CLASSES, 1),
+        )
+        norm = network[1]
+        assert isinstance(norm, nn.BatchNorm2d) and norm.running_mean is not None and norm.running_var is not None
+        # Statistics and factors of a network that has learned something: train and eval mode must differ.
+        norm.running_mean.copy_(0.3 * torch.randn(width))
+        norm.running_var.copy_(torch.rand(width) + 0.5)
+        with torch.no_grad():
+            norm.weight.copy_(torch.rand(width) + 0.5)
+            norm.bias.copy_(0.3 * torch.randn(width))
+    return network
+
+
+def small_scenes(
+    rng: np.random.Generator, count: int, brightness: float = 128.0, spread: float = 40.0, size: int = 8
+) -> SmallScenes:
+    """Return images of noise; their labels follow the colours, so that some network can be right about them."""
+    images = np.clip(rng.normal(brightness, spread, (count, size, size, 3)), 0, 255).astype(np.uint8)
+    labels = images.argmax(axis=3).astype(np.uint8)
+    labels[images.sum(axis=3) < 3 * brightness - spread] = 3
+    return SmallScenes(images, labels)
+
+
+def small_splits(rng: np.random.Generator, counts: Sequence[int] = (12, 8, 6, 10)) -> dict[str, SmallScenes]:
+    """Return train, calibration, validation and test scenes whose brightness differs: it shows which were used."""
+    names = ("train", "calibration", "validation", "test")
+    light = (100.0, 125.0, 145.0, 165.0)
+    return {
+        name: small_scenes(rng, count, bright, 30.0 + 4 * k)
+        for k, (name, count, bright) in enumerate(zip(names, counts, light, strict=True))
+    }
+
+
+def state_of(network: nn.Module) -> dict[str, Tensor]:
+    """Return copies of all parameters and buffers by name."""
+    return {name: value.detach().clone() for name, value in network.state_dict().items()}
+
+
+def changed(before: dict[str, Tensor], network: nn.Module) -> list[str]:
+    """Return the names whose values are not those of ``before``."""
+    now = network.state_dict()
+    return [name for name, value in before.items() if name not in now or not torch.equal(value, now[name])]
+
+
+def expect_untouched(network: nn.Module, before: dict[str, Tensor], what: str, hint: str) -> None:
+    """Fail where a parameter or a statistic of ``network`` changed."""
+    names = changed(before, network)
+    expect(not names, f"{what} was changed", got=", ".join(names[:6]), expected="the numbers it came with", hint=hint)
+
+
+def flat(network: nn.Module) -> Tensor:
+    """Return all floating-point numbers of a network, statistics included, in one row."""
+    return torch.cat([v.detach().ravel() for v in network.state_dict().values() if v.is_floating_point()])
+
+
+# ---------------------------------------------------------------- our own answers: numbers
+
+
+def choose_scale(low: float, high: float, symmetric: bool = False, bits: int = 8) -> tuple[float, int]:
+    """Return scale and zero point for real values between ``low`` and ``high``."""
+    low, high = min(float(low), 0.0), max(float(high), 0.0)
+    if symmetric:
+        return max(-low, high) / (2 ** (bits - 1) - 1) or 1.0, 0
+    scale = (high - low) / (2**bits - 1) or 1.0
+    return scale, round(-low / scale)
+
+
+def quantise(x: Any, scale: Any, zero_point: int, qmin: int = 0, qmax: int = 255) -> Array:
+    """Return the integers that stand for ``x``, int32."""
+    steps = np.rint(np.asarray(x, dtype=np.float64) / scale) + zero_point
+    return np.asarray(np.clip(steps, qmin, qmax), dtype=np.int32)
+
+
+def dequantise(q: Any, scale: Any, zero_point: int) -> Array:
+    """Return the real values that integers stand for, float32."""
+    return np.asarray((np.asarray(q).astype(np.float64) - zero_point) * scale, dtype=np.float32)
+
+
+def quantise_weights(weight: Any, per_channel: bool = True) -> tuple[Array, Array]:
+    """Return int8 weights and their scales, (O, 1, ...) or a single one."""
+    weight = np.asarray(weight)
+    axes = tuple(range(1, weight.ndim)) if per_channel else None
+    scale = np.abs(weight).max(axis=axes, keepdims=per_channel) / 127
+    scale = np.where(scale == 0, 1.0, scale)
+    return quantise(weight, scale, 0, -127, 127).astype(np.int8), scale
+
+
+def activation_range(
+    batches: Iterable[Any], percentile: float | None = None, method: Any = "linear"
+) -> tuple[float, float]:
+    """Return the range of all values in all batches; ``method`` as of ``np.percentile``."""
+    values = np.concatenate([np.ravel(batch) for batch in batches])
+    if percentile is None:
+        return float(values.min()), float(values.max())
+    top = float(np.percentile(np.abs(values), percentile, method=method))
+    return -top, top
+
+
+def outputs_of(network: nn.Module, inputs: Array, layers: Sequence[str], train: bool = False) -> dict[str, list[Array]]:
+    """Return the outputs of the named layers, batch by batch of 4; ``network`` is put back as it was."""
+    modes, before = [(m, m.training) for m in network.modules()], state_of(network)
+    found: dict[str, list[Array]] = {name: [] for name in layers}
+    modules = dict(network.named_modules())
+
+    def keep(name: str) -> Callable[..., None]:
+        return lambda _module, _inputs, output: found[name].append(output.detach().numpy().copy())
+
+    hooks = [modules[name].register_forward_hook(keep(name)) for name in layers]
+    try:
+        network.train(train)
+        with torch.no_grad():
+            for start in range(0, len(inputs), 4):
+                network(torch.from_numpy(inputs[start : start + 4]))
+    finally:
+        for hook in hooks:
+            hook.remove()
+        for module, training in modes:
+            module.training = training
+        network.load_state_dict(before)
+    return found
+
+
+# ---------------------------------------------------------------- our own answers: pruning
+
+
+def magnitude_mask(weight: Tensor, sparsity: float) -> Tensor:
+    """Return True where a weight stays; exactly round(sparsity n) go."""
+    drop = torch.argsort(weight.detach().abs().ravel(), stable=True)[: round(sparsity * weight.numel())]
+    mask = torch.ones(weight.numel(), dtype=torch.bool)
+    mask[drop] = False
+    return mask.view(weight.shape)
+
+
+def prunable(network: nn.Module) -> dict[str, Tensor]:
+    """Return the weights of all convolutions and linear layers by parameter name."""
+    return {
+        f"{name}.weight" if name else "weight": module.weight
+        for name, module in network.named_modules()
+        if isinstance(module, (nn.Conv2d, nn.Linear))
+    }
+
+
+# ---------------------------------------------------------------- our own answers: distillation
+
+
+def distillation_loss(
+    student_logits: Tensor, teacher_logits: Tensor, labels: Tensor, temperature: float = 4.0, alpha: float = 0.7
+) -> Tensor:
+    """Return alpha T^2 KL(teacher || student) + (1 - alpha) cross entropy with the labelled pixels."""
+    log_q = functional.log_softmax(student_logits / temperature, dim=1)
+    log_p = functional.log_softmax(teacher_logits.detach() / temperature, dim=1)
+    soft = (log_p.exp() * (log_p - log_q)).sum(dim=1).mean() * temperature**2
+    known = labels != IGNORE
+    if not bool(known.any()):
+        return alpha * soft
+    hard = functional.cross_entropy(student_logits, labels, ignore_index=IGNORE)
+    return alpha * soft + (1 - alpha) * hard
+
+
+def confusion(labels: Array, predicted: Array) -> NDArray[np.int64]:
+    """Return pixel counts (4, 4), rows the truth, columns the prediction."""
+    counts = np.zeros((CLASSES, CLASSES), dtype=np.int64)
+    np.add.at(counts, (labels.ravel(), predicted.ravel()), 1)
+    return counts
+
+
+def iou(counts: Array) -> float:
+    """Return the mean IoU over the classes that occur in truth or prediction."""
+    hit = np.diagonal(counts, axis1=-2, axis2=-1).astype(float)
+    union = counts.sum(axis=-1) + counts.sum(axis=-2) - hit
+    with np.errstate(invalid="ignore"):
+        return float(np.nanmean(hit / union))
