@@ -285,6 +285,26 @@ def test_what_a_function_does_counts() -> None:
     assert networks.inspect(model.SerializeToString()).quantised
 
 
+def test_a_network_without_an_end_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+    def info(name: str, kind: int, shape: list[int]) -> Any:
+        return helper.make_tensor_value_info(name, kind, shape)
+
+    one, many, go = np.float32(1), np.int64(2**62), np.array(True)
+    body = helper.make_graph(
+        [helper.make_node("Identity", ["c"], ["d"]), helper.make_node("Mul", ["v", "one"], ["w"])], "body",
+        [info("i", 7, []), info("c", 9, []), info("v", 1, [1, 4])], [info("d", 9, []), info("w", 1, [1, 4])],
+        [numpy_helper.from_array(one, "one")],
+    )  # fmt: skip
+    graph = helper.make_graph(
+        [helper.make_node("Loop", ["many", "go", "x"], ["y"], body=body)], "g", [info("x", 1, [1, 4])],
+        [info("y", 1, [1, 4])], [numpy_helper.from_array(many, "many"), numpy_helper.from_array(go, "go")],
+    )  # fmt: skip
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
+    monkeypatch.setattr(networks, "TIME_LIMIT_S", 0.2)
+    with pytest.raises(InputError, match="terminate"):
+        networks.run(model.SerializeToString(), [{"x": np.zeros((1, 4), np.float32)}])
+
+
 def test_sizes_that_no_bundle_holds_are_refused_before_they_are_made(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="smaller --batch"):
         bundle(tmp_path, batch=10**9)

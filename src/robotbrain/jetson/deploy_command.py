@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -113,12 +112,12 @@ def _preprocessing(arguments: argparse.Namespace) -> Any:
 
 
 def _classes(words: str) -> tuple[str, ...]:
-    if not os.path.isfile(words):  # a pathlib.Path would raise for a list that is too long for a path
-        return tuple(split_words(words))
     try:
         lines = Path(words).read_text(encoding="utf-8-sig").splitlines()
-    except ValueError as error:
-        raise InputError("--classes", given=words, expected="text in UTF-8, a name a line", fix="Save it so.") from error
+    except UnicodeDecodeError as error:
+        raise InputError("--classes", given=words, expected="a file in UTF-8", fix="Save it so.") from error
+    except (OSError, ValueError):  # no such file; a list of many names is not even a path
+        return tuple(split_words(words))
     return tuple(name for line in lines if (name := line.strip()))
 
 

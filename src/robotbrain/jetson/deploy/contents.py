@@ -172,9 +172,11 @@ def _mode(name: str) -> int:
 def _is_ours(folder: Path) -> bool:
     """Whether a folder is empty or holds a bundle and nothing beside it: only that may be replaced."""
     names = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir()}
+    if not names:
+        return True
     try:
-        manifest = json.loads((folder / "manifest.json").read_bytes()) if names else None
-        return not names or names <= {*manifest["files"], "manifest.json", "manifest.sha256"}
+        listed = json.loads((folder / "manifest.json").read_bytes())["files"]
+        return names <= {*listed, "manifest.json", "manifest.sha256"}
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return False
 

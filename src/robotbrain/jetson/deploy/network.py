@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import re
+import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -22,6 +23,9 @@ MODEL = "model.onnx"
 
 VECTORS = 3
 """Inputs with expected outputs in a bundle."""
+
+TIME_LIMIT_S = 300.0
+"""Time for computing all expected outputs, s."""
 
 TOLERANCES: Mapping[str, Mapping[str, float]] = {
     "fp32": {"rms": 1e-4, "peak": 1e-3, "agreement": 0.999},
@@ -247,7 +251,7 @@ def run(content: bytes, inputs: Sequence[Mapping[str, NDArray[Any]]]) -> list[di
     """Return the outputs by name of ONNX Runtime without optimisation (INT8 is emulated in float then), one thread.
 
     Raises:
-        InputError: if it cannot run the network, or the outputs are not finite.
+        InputError: if it cannot run the network, not within TIME_LIMIT_S, or the outputs are not finite.
     """
     import onnxruntime
 
@@ -256,10 +260,16 @@ def run(content: bytes, inputs: Sequence[Mapping[str, NDArray[Any]]]) -> list[di
     options.log_severity_level = 4
     # INT8 kernels of some processors saturate; float emulation is the reference everywhere.
     options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
+    # A Loop may go on for ever, and an interrupt from the keyboard does not reach ONNX Runtime.
+    limits = onnxruntime.RunOptions()
+    limits.log_severity_level = 4
+    timer = threading.Timer(TIME_LIMIT_S, setattr, (limits, "terminate", True))
+    timer.daemon = True
+    timer.start()
     try:
         session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
         names = [output.name for output in session.get_outputs()]
-        results = [dict(zip(names, session.run(names, dict(feed)), strict=True)) for feed in inputs]
+        results = [dict(zip(names, session.run(names, dict(feed), limits), strict=True)) for feed in inputs]
     except Exception as error:  # ONNX Runtime raises a family of its own, without a common public base
         raise InputError(
             "model",
@@ -267,6 +277,8 @@ def run(content: bytes, inputs: Sequence[Mapping[str, NDArray[Any]]]) -> list[di
             expected="a network that runs here, too",
             fix=f"ONNX Runtime says: {str(error).splitlines()[0][:200]}",
         ) from error
+    finally:
+        timer.cancel()
     if not all(value.size and np.isfinite(value).all() for result in results for value in result.values()):
         raise InputError(
             "model", given="NaN, infinity or no values", expected="finite outputs", fix="Check weights and inputs."

@@ -46,8 +46,7 @@ FORM: Mapping[str, Any] = {
     "cuda_graph": bool,
     "runs": [{"trtexec": _NAME, "tegrastats": (None, _NAME)}],
     "numerics": [
-        {"vector": int, "output": str, "positions": int}
-        | dict.fromkeys(("rms", "peak", "agreement"), (float, int))
+        {"vector": int, "output": str, "positions": int} | dict.fromkeys(("rms", "peak", "agreement"), (float, int))
     ],
     "notes": [str],
     "files": {"*": {"bytes": int, "sha256": _SHA}},

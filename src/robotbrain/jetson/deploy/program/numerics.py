@@ -26,7 +26,8 @@ def check(
         # Relative: a comma or colon in the path would end it.
         inputs = ",".join(quoted(name) + ":" + file for name, file in vector["inputs"].items())
         command = [program.path, "--loadEngine=" + str(engine), *shape_flags(manifest["network"])]
-        command += ["--loadInputs=" + inputs, "--iterations=1", "--duration=0", "--warmUp=0", "--exportOutput=" + str(answer)]
+        command += ["--loadInputs=" + inputs]
+        command += ["--iterations=1", "--duration=0", "--warmUp=0", "--exportOutput=" + str(answer)]
         try:
             run(command, work / f"numerics_{index}.log", f"check {index + 1}", folder)
             outputs = read_outputs(answer)
