@@ -62,6 +62,8 @@ HINTS = {
     "symmetric-range": "Asymmetric was asked for: the range goes from low to high, and the zero point says where 0 is.",
     "zero-point-places-zero": "The zero point is the integer that stands for 0.0: `low` is stood for by 0, and 0.0 "
     "lies -low / scale steps above it.",
+    "scale-comes-first": "The answer is (scale, zero_point), in this order.",
+    "other-widths": "The number of bits is given: four of them have 15 steps, and symmetric 7.",
     "whole-numbers": "Zero point and quantised values are whole numbers, of an integer type.",
     "some-scale": "A tensor of zeros still needs a scale: any finite number above 0 will do (1.0).",
     "nearest-not-below": "Round to the nearest integer (`np.rint`). Casting to int cuts off, and doubles the error.",
@@ -74,12 +76,14 @@ HINTS = {
     "subtract-before-scaling": "real = scale * (q - zero_point): subtract first, then scale.",
     "uint8-cannot-be-negative": "In uint8, 3 - 5 is 254: change the type before you subtract.",
     "floats-come-back": "dequantise returns real numbers, float32.",
+    "leave-the-input": "`x /= scale` changes the caller's array: make a new one, `x / scale`.",
     "half-a-step": "Rounding to the nearest level is off by half a step at most.",
     "one-scale-each": "Per channel means one scale for each output channel (axis 0), from that channel's own weights.",
     "output-channels": "The output channels lie on axis 0 of a weight: one scale for each of them.",
     "one-scale-for-all": "per_channel=False: one scale for the whole tensor.",
     "largest-magnitude": "The largest MAGNITUDE counts: a channel may be all negative.",
     "dead-channel": "A channel of zeros has a largest magnitude of 0. Its scale must not be: use 1.0 there.",
+    "one-byte-each": "Nothing is saved before the weights are stored in eight bits: `.astype(np.int8)`, at the end.",
     "symmetric-int8": "Symmetric int8 weights use -127 to 127: 127 is the largest magnitude, and -128 stays unused.",
     "all-batches": "The range is that of ALL values in ALL batches, not of one batch, nor an average of batches.",
     "min-and-max": "Without a percentile the range is (smallest, largest), each as it is.",
@@ -103,12 +107,12 @@ def compare_verdicts(answer: Any, letters: str) -> None:
     if not isinstance(answer, Mapping):
         fail("VERDICTS should be a dict", got=answer, expected='{"a": "fine", ...}')
     words = ("breaks", "wastes", "fine")
-    unknown = {k: answer[k] for k in letters if k in answer and answer[k] not in words}
-    expect(not unknown, "that is not one of the three words", got=unknown, expected=words)
     wrong = [letter for letter in letters if answer.get(letter) != VERDICTS[letter]]
     if not wrong:
         return
     right = len(letters) - len(wrong)
+    unknown = {k: answer[k] for k in wrong if k in answer and answer[k] not in words}
+    expect(not unknown, "that is not one of the three words", got=unknown, expected=words, credit=right / len(letters))
     first = wrong[0]
     fail(
         f"{right} of {len(letters)} are right; look again at {first!r}",
@@ -131,7 +135,9 @@ def compare_scale(student: Any, low: float, high: float, symmetric: bool, bits: 
     except (TypeError, ValueError):
         fail("the answer should be two numbers", got=answer, expected="(scale, zero_point)", given=given)
     if not (math.isfinite(got_scale) and got_scale > 0):
-        fail("a scale is a finite number above 0", got=got_scale, given=given, hint="some-scale")
+        swapped = math.isclose(got_zero, scale, rel_tol=1e-5) and got_scale == zero
+        fail("a scale is a finite number above 0", got=got_scale, given=given,
+             hint="scale-comes-first" if swapped else "some-scale")  # fmt: skip
     if low == high == 0:
         expect(got_zero == int(got_zero) and 0 <= got_zero <= 2**bits - 1, "the zero point is not one of the levels",
                got=got_zero, given=given, hint="whole-numbers")  # fmt: skip
@@ -149,7 +155,9 @@ def _scale_mistake(answer: tuple[float, float], low: float, high: float, symmetr
     right = tools.choose_scale(low, high, symmetric, bits)
     other = tools.choose_scale(low, high, not symmetric, bits)
     kind = "asymmetric-range" if symmetric else "symmetric-range"
-    mistakes: list[tuple[str, Any]] = [(kind, other)]
+    mistakes: list[tuple[str, Any]] = [(kind, other), ("scale-comes-first", right[::-1])]
+    if bits != 8:
+        mistakes.append(("other-widths", tools.choose_scale(low, high, symmetric)))
     if symmetric:
         mistakes += [("levels-not-steps", (top / half, 0)), ("levels-not-steps", (2 * top / (levels - 1), 0)),
                      ("levels-not-steps", (2 * top / levels, 0)), (kind, (span / (levels - 2), 0)),
@@ -176,15 +184,26 @@ def _near(value: float) -> tuple[float, ...]:
 # ---------------------------------------------------------------- quantise, dequantise
 
 
+def forgive_ties(answer: Array, expected: Array, x: Array, scale: Any) -> Array:
+    """Return ``answer`` with ``expected`` where ``x`` lies, up to rounding, in the middle of two levels: either serves."""
+    if answer.shape != expected.shape or answer.dtype.kind not in "iu":
+        return answer
+    steps = np.asarray(x, dtype=float) / scale
+    tie = np.abs(steps - np.floor(steps) - 0.5) < 1e-4
+    return np.where(tie & (np.abs(answer.astype(np.int64) - expected) <= 1), expected, answer)
+
+
 def compare_quantise(student: Any, x: Array, scale: Any, zero_point: int, qmin: int, qmax: int, given: str) -> None:
-    """Compare with the nearest level, clipped. ``x`` should avoid the middle between two levels."""
+    """Compare with the nearest level, clipped; in the middle between two levels either will do."""
     expected = tools.quantise(x, scale, zero_point, qmin, qmax)
-    answer = student(x.copy(), scale, zero_point, qmin=qmin, qmax=qmax)
-    array = np.asarray(answer)
+    mine = x.copy()
+    array = np.asarray(student(mine, scale, zero_point, qmin=qmin, qmax=qmax))
+    expect(np.array_equal(mine, x), "x was changed", got=mine, expected=x, given=given, hint="leave-the-input")
     if array.dtype.kind not in "iu" and array.dtype.kind in "f":
         cut = array.shape == expected.shape and np.array_equal(np.clip(np.rint(array), qmin, qmax), expected)
         fail("quantise should return an array of integers", got=str(array.dtype), expected="an integer type",
              given=given, hint="whole-numbers" if cut or array.shape == expected.shape else "")  # fmt: skip
+    array = forgive_ties(array, expected, x, scale)
     steps = np.asarray(x, dtype=float) / scale
     near = np.rint(steps)
     shifted = near + zero_point
@@ -198,6 +217,7 @@ def compare_quantise(student: Any, x: Array, scale: Any, zero_point: int, qmin: 
         ("nearest-not-below", clip(np.trunc(steps + zero_point))),
         ("nearest-not-below", clip(np.floor(steps) + zero_point)),
         ("nearest-not-below", clip(np.ceil(steps) + zero_point)),
+        ("nearest-not-below", clip(np.trunc(steps + 0.5) + zero_point)),
         ("zero-point-ignored", clip(near)),
         ("zero-point-ignored", clip(near - zero_point)),
         ("clip-to-the-range", shifted),
@@ -239,9 +259,13 @@ def check_round_trip(quantise: Any, dequantise: Any, scale: float, zero_point: i
     """All 256 levels survive the way back and forth, and 0.0 is exact."""
     levels = np.arange(256, dtype=np.uint8)
     back = np.asarray(quantise(dequantise(levels, scale, zero_point), scale, zero_point, qmin=0, qmax=255))
+    hint = "zero-point-ignored"
+    if back.shape == levels.shape and back.dtype.kind in "iu":
+        apart = back.astype(np.int64) - levels
+        hint = "wrapped-around" if not (apart % 256).any() else "nearest-not-below" if abs(apart).max() <= 1 else hint
     expect(np.array_equal(back, levels), "a level does not survive dequantise and quantise",
            given=f"scale = {scale:.4g}, zero_point = {zero_point}, levels 0 to 255", got=back, expected=levels,
-           hint="zero-point-ignored")  # fmt: skip
+           hint=hint)  # fmt: skip
     zero = np.asarray(dequantise(quantise(np.zeros(1), scale, zero_point, qmin=0, qmax=255), scale, zero_point))
     expect(float(zero[0]) == 0.0, "0.0 comes back as another number", got=float(zero[0]), expected=0.0,
            hint="zero-point-ignored")  # fmt: skip
@@ -254,7 +278,7 @@ def check_half_a_step(quantise: Any, dequantise: Any, rng: np.random.Generator) 
         scale, zero = tools.choose_scale(low, high)
         least, most = -zero * scale, (255 - zero) * scale
         x = rng.uniform(1.5 * low, 1.5 * high, 2000).astype(np.float32)
-        y = np.asarray(dequantise(quantise(x, scale, zero, qmin=0, qmax=255), scale, zero), dtype=float)
+        y = np.asarray(dequantise(quantise(x.copy(), scale, zero, qmin=0, qmax=255), scale, zero), dtype=float)
         worst = float(np.abs(y - np.clip(x, least, most)).max())
         expect(worst <= 0.5001 * scale, "a value in the range is off by more than half a step", hint="half-a-step",
                given=f"2000 values, scale = {scale:.4g}, zero_point = {zero}",
@@ -288,6 +312,7 @@ def compare_weights(student: Any, weight: Array, per_channel: bool, given: str) 
     if got_q.dtype.kind not in "iu":
         fail("quantised weights are integers", got=str(got_q.dtype), expected="int8", given=given,
              hint="whole-numbers")  # fmt: skip
+    kind = str(got_q.dtype)
     axes = tuple(range(1, weight.ndim)) if per_channel else None
     largest = np.abs(weight).max(axis=axes, keepdims=per_channel)
     alive = largest > 0  # any scale serves a channel of zeros
@@ -311,8 +336,11 @@ def compare_weights(student: Any, weight: Array, per_channel: bool, given: str) 
         ("nearest-not-below", np.floor(weight / got_scale)),
         ("wrapped-around", np.mod(whole, 256)),
     ]
+    got_q = forgive_ties(got_q, whole, weight, got_scale)
     expect_close(got_q, whole, atol=0.0, given=given, hint=tools.first_match(got_q, near, whole),
                  what="the quantised weights")  # fmt: skip
+    expect(kind == "int8", "quantised weights take one byte each", got=kind, expected="int8", given=given,
+           hint="one-byte-each", credit=0.5)  # fmt: skip
 
 
 def channels_of_all_sizes(rng: np.random.Generator, shape: tuple[int, ...], dead: bool = False) -> Array:
