@@ -1,17 +1,12 @@
 """Running a policy from an ONNX file, which may be a stranger's.
 
-A submitted policy is data from somebody unknown. Before ONNX Runtime sees it, the file is parsed here and refused
-unless it is small, refers to no other file, holds only stateless arithmetic without loops, and costs little for one
-observation. What is left cannot read files, run on for ever, or ask for much memory. A grader still runs it in a
-process of its own: parsers have bugs.
+Before ONNX Runtime sees it, :mod:`robotbrain.untrusted_onnx` refuses what is too large, too dear or no plain
+feed-forward arithmetic; the limits are here.
 """
 
 from __future__ import annotations
 
-import os
-import stat
-from collections.abc import Iterator
-from math import prod
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +15,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from robotbrain.errors import InputError
 from robotbrain.rl.policy_meta import PolicyMeta
+from robotbrain.untrusted_onnx import (
+    Limits,
+    check_graph,
+    check_work,
+    first_line,
+    open_session,
+    parse_limited,
+    read_limited,
+    tensors_of,
+)
 
 MAX_BYTES = 16 * 2**20
 """A policy of four million float32 weights; the kit's own have some fifty thousand."""
@@ -50,6 +55,20 @@ ALLOWED_OPS = frozenset((
 # fmt: on
 """Operators of ONNX's own domain that a feed-forward policy needs: no control flow, no state, no random numbers."""
 
+LIMITS = Limits(
+    what="policy",
+    fix=EXPORT_AGAIN,
+    ops=ALLOWED_OPS,
+    opsets=range(MIN_OPSET, MIN_OPSET + 1),  # to the newest that the installed onnx knows: see checked_model
+    rows=ROWS,
+    max_nodes=MAX_NODES,
+    max_elements=MAX_ELEMENTS,
+    max_written=MAX_WRITTEN,
+    max_work=MAX_WORK,
+    slow=SLOW,
+    slow_ops=SLOW_OPS,
+)
+
 
 class OnnxPolicy:
     """A policy: float32 observations (n, O) in, actions (n, A) out.
@@ -70,10 +89,11 @@ class OnnxPolicy:
 
     def __init__(self, path: str | Path, *, max_bytes: int = MAX_BYTES, meta: PolicyMeta | None = None) -> None:
         self.path = Path(path)
-        data = read_limited(self.path, max_bytes)
+        folder = f"Of a training run: `robotbrain rl export {path}` writes it, as {self.path / 'policy.onnx'}."
+        data = read_limited(self.path, max_bytes, what="policy", folder_fix=folder, fix=EXPORT_AGAIN)
         model = checked_model(data)
         self.meta = meta or PolicyMeta.from_metadata({p.key: p.value for p in model.metadata_props})
-        self._session = _session(data)
+        self._session = open_session(data, LIMITS)
         source, target = self._session.get_inputs()[0], self._session.get_outputs()[0]
         self._input, self._output = source.name, target.name
         _check_width("obs", source.shape[1], self.meta.observation_dim)
@@ -131,38 +151,12 @@ class OnnxPolicy:
             actions: NDArray[np.float32] = self._session.run([self._output], {self._input: rows})[0]
         except Exception as error:  # ONNX Runtime raises a family of its own, without a common public base
             raise InputError(
-                "policy", given=str(self.path), expected="a network that runs", fix=_first_line(error)
+                "policy", given=str(self.path), expected="a network that runs", fix=first_line(error)
             ) from error
         expected = (len(rows), self.meta.action_dim)
         if actions.shape != expected:
             raise _refuse("actions", f"shape {actions.shape}", f"{expected}: {', '.join(self.meta.action_names)}")
         return actions
-
-
-def read_limited(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
-    """Return the content of a regular file of 1 to ``max_bytes`` bytes; what is checked is what is read.
-
-    Raises:
-        InputError: for anything else.
-    """
-    if path.is_dir():
-        fix = f"Of a training run: `robotbrain rl export {path}` writes it, as {path / 'policy.onnx'}."
-        raise _refuse("policy", f"{path} (a folder)", "an ONNX file", fix)
-    try:
-        # Without O_NONBLOCK, opening a pipe would wait for its writer for ever.
-        handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
-        with os.fdopen(handle, "rb") as file:
-            if not stat.S_ISREG(os.fstat(handle).st_mode):
-                raise _refuse("policy", f"{path} (no regular file)", "an ONNX file")
-            data = file.read(max_bytes + 1)
-    except (OSError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise _refuse("policy", str(path), "the path of an ONNX file", f"The system says: {error}") from error
-    if not 0 < len(data) <= max_bytes:
-        shown = "more" if data else "no"
-        raise _refuse("policy", f"{path} ({shown} bytes)", f"1 to {max_bytes} bytes", "Train a smaller network.")
-    return data
 
 
 def checked_model(data: bytes) -> Any:
@@ -173,71 +167,20 @@ def checked_model(data: bytes) -> Any:
     """
     import onnx
 
-    model = onnx.ModelProto()
-    try:
-        model.ParseFromString(data)
-    except Exception as error:  # protobuf's implementations raise classes of their own
-        raise _refuse("policy", f"{len(data)} bytes that do not parse", "an ONNX file") from error
-    graph = model.graph
-    _check_opset(model)
-    if not 1 <= len(graph.node) <= MAX_NODES:
-        raise _refuse("policy", f"{len(graph.node)} nodes", f"1 to {MAX_NODES}", "Train a simpler network.")
-    for node in graph.node:
-        if node.domain not in ("", "ai.onnx") or node.op_type not in ALLOWED_OPS:
-            given = f"{node.domain}::{node.op_type}" if node.domain else node.op_type
-            raise _refuse("operator of the policy", given, "one of " + ", ".join(sorted(ALLOWED_OPS)))
-        for attribute in node.attribute:
-            if attribute.HasField("g") or attribute.graphs or attribute.ref_attr_name:
-                raise _refuse("operator of the policy", f"{node.op_type} with a graph inside", "plain arithmetic")
-            if attribute.HasField("sparse_tensor") or attribute.sparse_tensors:
-                raise _refuse("weights of the policy", "sparse tensors", "dense ones")
-    if model.functions or model.training_info or graph.sparse_initializer:
-        raise _refuse("policy", "functions, training information or sparse weights", "one plain graph")
-    for tensor in _tensors(graph):
-        _check_tensor(tensor)
-    _check_ends(graph)
-    try:
-        onnx.checker.check_model(model)
-    except Exception as error:  # the C++ side raises several kinds
-        raise _refuse("policy", _first_line(error), "a valid ONNX graph") from error
-    _check_work(model)
-    return model
-
-
-def _check_opset(model: Any) -> None:
-    import onnx
-
     newest = onnx.defs.onnx_opset_version()
-    versions = {entry.domain: entry.version for entry in model.opset_import}
-    version = versions.pop("", None) or versions.pop("ai.onnx", None)
-    if version is None or not MIN_OPSET <= version <= newest:
-        raise _refuse("opset of the policy", version, f"{MIN_OPSET} to {newest}")
-    # Exporters also list domains that they did not use; nodes are checked one by one.
-
-
-def _tensors(graph: Any) -> Iterator[Any]:
-    yield from graph.initializer
-    for node in graph.node:
-        for attribute in node.attribute:
-            if attribute.HasField("t"):
-                yield attribute.t
-            yield from attribute.tensors
-
-
-def _check_tensor(tensor: Any) -> None:
-    import onnx
-
-    if tensor.external_data or tensor.data_location == onnx.TensorProto.EXTERNAL:
-        raise _refuse(
-            "weights of the policy", "weights in another file", "weights inside", "Export with external_data=False."
-        )
+    limits = replace(LIMITS, opsets=range(MIN_OPSET, newest + 1))
+    model = parse_limited(data, limits)
     kinds = (onnx.TensorProto.FLOAT, onnx.TensorProto.INT64, onnx.TensorProto.INT32, onnx.TensorProto.BOOL)
-    if tensor.data_type not in (*kinds, onnx.TensorProto.DOUBLE):
-        raise _refuse(
-            "weights of the policy", f"data type {tensor.data_type}", "float32, float64, int32, int64 or bool"
-        )
-    if any(d < 0 for d in tensor.dims) or prod(tensor.dims) > MAX_ELEMENTS:
-        raise _refuse("weights of the policy", tuple(tensor.dims), f"at most {MAX_ELEMENTS} numbers in a tensor")
+    for tensor in tensors_of(model.graph):
+        if tensor.data_type not in (*kinds, onnx.TensorProto.DOUBLE):
+            given = f"data type {tensor.data_type}"
+            raise limits.refuse("weights", given, "float32, float64, int32, int64 or bool")
+    _check_ends(model.graph)
+    check_graph(model, limits)
+    weights = {tensor.name for tensor in model.graph.initializer}
+    obs = next(value for value in model.graph.input if value.name not in weights)
+    check_work(model, limits, once_per_row=obs.type.tensor_type.shape.dim[0].HasField("dim_value"))
+    return model
 
 
 def _check_ends(graph: Any) -> None:
@@ -255,88 +198,6 @@ def _check_ends(graph: Any) -> None:
             raise _refuse(f"{what} of the policy", f"a batch of {batch.dim_value}", "any batch, or one row")
 
 
-def _check_work(model: Any) -> None:
-    """Refuse what needs much time or memory: broadcasting can make a small file ask for terabytes."""
-    import onnx
-
-    one = onnx.ModelProto()
-    one.CopyFrom(model)
-    del one.graph.value_info[:]  # the file's own claims
-    for end in (*one.graph.input, *one.graph.output):
-        batch = end.type.tensor_type.shape.dim[:1]
-        if batch and not batch[0].HasField("dim_value"):
-            batch[0].dim_value = ROWS
-    try:
-        graph = onnx.shape_inference.infer_shapes(one, check_type=True, strict_mode=True, data_prop=True).graph
-    except Exception as error:  # the C++ side raises several kinds
-        raise _refuse("policy", _first_line(error), "shapes that fit") from error
-    shapes: dict[str, tuple[int, ...]] = {t.name: tuple(t.dims) for t in graph.initializer}
-    floats = (onnx.TensorProto.FLOAT, onnx.TensorProto.DOUBLE)
-    whole = set()
-    for value in (*graph.input, *graph.value_info, *graph.output):
-        if value.type.tensor_type.elem_type not in floats:
-            whole.add(value.name)
-        dims = value.type.tensor_type.shape.dim
-        if all(d.HasField("dim_value") for d in dims):
-            shapes[value.name] = tuple(d.dim_value for d in dims)
-    work = written = 0
-    for node in graph.node:
-        if node.op_type == "Div" and whole.intersection(node.output):
-            # A division of integers by zero ends the process.
-            raise _refuse("operator of the policy", "Div of integers", "Div of floating-point numbers")
-        for name in filter(None, node.output):
-            if name not in shapes:
-                raise _refuse("policy", f"{node.op_type} of unknown size", "sizes that follow from the observation's")
-            size = prod(shapes[name])
-            if size > MAX_ELEMENTS:
-                raise _refuse("policy", f"{node.op_type} of shape {shapes[name]}", f"at most {MAX_ELEMENTS} numbers")
-            written += size
-            work += size * _terms(node, shapes)
-        work += sum(prod(shapes.get(name, ())) for name in node.input)
-    weights = {tensor.name for tensor in graph.initializer}
-    obs = next(value for value in model.graph.input if value.name not in weights)
-    if obs.type.tensor_type.shape.dim[0].HasField("dim_value"):
-        work *= ROWS  # a batch fixed at one row is run once for each observation
-    if written > MAX_WRITTEN:
-        raise _refuse(
-            "policy",
-            f"{written} numbers in all nodes' outputs",
-            f"at most {MAX_WRITTEN} for {ROWS} observations",
-            "Train a smaller network.",
-        )
-    if work > MAX_WORK:
-        raise _refuse(
-            "policy", f"{work} operations for {ROWS} observations", f"at most {MAX_WORK}", "Train a smaller network."
-        )
-
-
-def _terms(node: Any, shapes: dict[str, tuple[int, ...]]) -> int:
-    """Return the cost of one number of the node's output: how many products are summed into it, for instance."""
-    first = shapes.get(node.input[0], ()) if node.input else ()
-    if node.op_type == "MatMul":
-        return first[-1] if first else 1
-    if node.op_type == "Gemm":
-        return max(first, default=1)
-    if node.op_type == "Conv":
-        return prod(shapes.get(node.input[1], ())[1:])
-    return SLOW if node.op_type in SLOW_OPS else 1
-
-
-def _session(data: bytes) -> Any:
-    import onnxruntime
-
-    options = onnxruntime.SessionOptions()
-    # One thread: the nets are small, and results must not depend on the machine's core count.
-    options.intra_op_num_threads = 1
-    options.inter_op_num_threads = 1
-    options.use_deterministic_compute = True
-    options.log_severity_level = 4
-    try:
-        return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # ONNX Runtime raises a family of its own, without a common public base
-        raise _refuse("policy", _first_line(error), "a network that ONNX Runtime takes") from error
-
-
 def _check_width(what: str, given: object, expected: int) -> None:
     if isinstance(given, int) and given != expected:
         raise _refuse(
@@ -346,8 +207,3 @@ def _check_width(what: str, given: object, expected: int) -> None:
 
 def _refuse(what: str, given: object, expected: str, fix: str = EXPORT_AGAIN) -> InputError:
     return InputError(what, given=given, expected=expected, fix=fix)
-
-
-def _first_line(error: Exception) -> str:
-    lines = str(error).splitlines()
-    return lines[0][:200] if lines else type(error).__name__

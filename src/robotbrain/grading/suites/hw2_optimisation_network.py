@@ -1,15 +1,12 @@
 """How `hw2_optimisation` reads a submitted network: as data from a stranger.
 
-Before ONNX Runtime or the twin sees the file it is parsed here, and refused unless it is small, refers to no other
-file, holds only stateless arithmetic without loops, and costs little for one image. It runs in the sandboxed process
-that grades the notebook.
+Before ONNX Runtime or the twin sees the file, :mod:`robotbrain.untrusted_onnx` judges it by the limits given here. It
+runs in the sandboxed process that grades the notebook.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +15,15 @@ import numpy as np
 from robotbrain.errors import InputError
 from robotbrain.grading import expect, fail
 from robotbrain.grading.suites.hw2_optimisation_tools import Array
-from robotbrain.rl.onnx_policy import read_limited
+from robotbrain.untrusted_onnx import (
+    Limits,
+    check_graph,
+    check_work,
+    first_line,
+    open_session,
+    parse_limited,
+    read_limited,
+)
 
 MAX_BYTES = 16 * 2**20
 """Four times the teacher: what is merely too large for the budget is told so by its own test."""
@@ -47,6 +52,18 @@ ALLOWED_OPS = frozenset((
 ))
 # fmt: on
 """Operators that a segmentation network needs: no control flow, no state, no random numbers, no library of its own."""
+
+LIMITS = Limits(
+    what="network",
+    fix="Export the network again with export_onnx.",
+    ops=ALLOWED_OPS,
+    opsets=OPSETS,
+    rows=BATCH,
+    max_nodes=MAX_NODES,
+    max_elements=MAX_ELEMENTS,
+    max_written=MAX_WRITTEN,
+    max_work=MAX_WORK,
+)
 
 HINTS = {
     "file-beside-the-notebook": "The file must lie beside the notebook, under the name that the notebook gives it, and "
@@ -117,121 +134,15 @@ def checked_model(data: bytes) -> Any:
     Raises:
         InputError: otherwise.
     """
-    import onnx
-
-    model = onnx.ModelProto()
-    try:
-        model.ParseFromString(data)
-    except Exception as error:  # protobuf's implementations raise classes of their own
-        raise _refuse("the file", f"{len(data)} bytes that do not parse", "an ONNX file") from error
-    graph = model.graph
-    versions = {entry.domain: entry.version for entry in model.opset_import}
-    version = versions.get("", versions.get("ai.onnx"))
-    if version not in OPSETS:
-        raise _refuse("its opset", version, f"{OPSETS[0]} to {OPSETS[-1]}")
-    if not 1 <= len(graph.node) <= MAX_NODES:
-        raise _refuse("its nodes", len(graph.node), f"1 to {MAX_NODES}")
-    for node in graph.node:
-        if node.domain not in ("", "ai.onnx") or node.op_type not in ALLOWED_OPS:
-            given = f"{node.domain}::{node.op_type}" if node.domain else node.op_type
-            raise _refuse("one of its operators", given, "one of " + ", ".join(sorted(ALLOWED_OPS)))
-        for attribute in node.attribute:
-            if attribute.HasField("g") or attribute.graphs or attribute.ref_attr_name:
-                raise _refuse("one of its operators", f"{node.op_type} with a graph inside", "plain arithmetic")
-            if attribute.HasField("sparse_tensor") or attribute.sparse_tensors:
-                raise _refuse("its weights", "sparse tensors", "dense ones")
-    if model.functions or model.training_info or graph.sparse_initializer:
-        raise _refuse("the file", "functions, training information or sparse weights", "one plain graph")
-    for tensor in _tensors(graph):
-        if tensor.external_data or tensor.data_location == onnx.TensorProto.EXTERNAL:
-            raise _refuse("its weights", "weights in another file", "weights inside")
-        if any(d < 0 for d in tensor.dims) or prod(tensor.dims) > MAX_ELEMENTS:
-            raise _refuse("its weights", tuple(tensor.dims), f"at most {MAX_ELEMENTS} numbers in a tensor")
-    try:
-        onnx.checker.check_model(model)
-    except Exception as error:  # the C++ side raises several kinds
-        raise _refuse("the graph", _first_line(error), "a valid ONNX graph") from error
-    _check_work(model)
+    model = parse_limited(data, LIMITS)
+    check_graph(model, LIMITS)
+    check_work(model, LIMITS)
     return model
 
 
-def _tensors(graph: Any) -> Iterator[Any]:
-    yield from graph.initializer
-    for node in graph.node:
-        for attribute in node.attribute:
-            if attribute.HasField("t"):
-                yield attribute.t
-            yield from attribute.tensors
-
-
-def _check_work(model: Any) -> None:
-    """Refuse what needs much time or memory: a resize can make a small file ask for terabytes."""
-    import onnx
-
-    one = onnx.ModelProto()
-    one.CopyFrom(model)
-    del one.graph.value_info[:]  # the file's own claims
-    for end in (*one.graph.input, *one.graph.output):
-        batch = end.type.tensor_type.shape.dim[:1]
-        if batch and not batch[0].HasField("dim_value"):
-            batch[0].dim_value = BATCH
-    try:
-        graph = onnx.shape_inference.infer_shapes(one, check_type=True, strict_mode=True, data_prop=True).graph
-    except Exception as error:  # the C++ side raises several kinds
-        raise _refuse("the graph", _first_line(error), "shapes that fit") from error
-    shapes: dict[str, tuple[int, ...]] = {t.name: tuple(t.dims) for t in graph.initializer}
-    whole = set()
-    for value in (*graph.input, *graph.value_info, *graph.output):
-        if value.type.tensor_type.elem_type in (onnx.TensorProto.INT32, onnx.TensorProto.INT64):
-            whole.add(value.name)
-        dims = value.type.tensor_type.shape.dim
-        if all(d.HasField("dim_value") for d in dims):
-            shapes[value.name] = tuple(d.dim_value for d in dims)
-    work = written = 0
-    for node in graph.node:
-        if node.op_type == "Div" and whole.intersection(node.output):
-            # A division of integers by zero ends the process.
-            raise _refuse("one of its operators", "Div of integers", "Div of floating-point numbers")
-        for name in filter(None, node.output):
-            if name not in shapes:
-                raise _refuse("the graph", f"{node.op_type} of unknown size", "sizes that follow from the image's")
-            size = prod(shapes[name])
-            if size > MAX_ELEMENTS:
-                raise _refuse("the graph", f"{node.op_type} of shape {shapes[name]}", f"at most {MAX_ELEMENTS} numbers")
-            written += size
-            work += size * _terms(node, shapes)
-    if written > MAX_WRITTEN or work > MAX_WORK:
-        given = f"{work / 1e6 / BATCH:.0f} million operations and {written // BATCH} numbers for one image"
-        raise _refuse("its cost", given, f"at most {MAX_WORK / 1e6 / BATCH:.0f} million and {MAX_WRITTEN // BATCH}")
-
-
-def _terms(node: Any, shapes: dict[str, tuple[int, ...]]) -> int:
-    """Return an upper bound of the multiply-adds for one number of the node's output."""
-    if node.op_type == "Conv":
-        return max(1, prod(shapes.get(node.input[1], ())[1:]))
-    if node.op_type == "ConvTranspose":  # what its pads cut off is computed, too
-        steps = prod(shapes.get(node.input[0], ())) * prod(shapes.get(node.input[1], ())[1:])
-        return max(1, steps // max(1, prod(shapes[node.output[0]])))
-    if node.op_type in ("MatMul", "Gemm"):
-        return max(shapes.get(node.input[0], (1,)), default=1)
-    if node.op_type in ("MaxPool", "AveragePool"):
-        return prod(next((tuple(a.ints) for a in node.attribute if a.name == "kernel_shape"), (1,)))
-    return 1
-
-
 def _session(data: bytes) -> Any:
-    import onnxruntime
-
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.use_deterministic_compute = True
-    options.log_severity_level = 4
     # As it is written, Q/DQ pairs around float operators: fused integer kernels saturate on some CPUs, this does not.
-    options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
-    try:
-        return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # ONNX Runtime raises a family of its own, without a common public base
-        raise _refuse("the network", _first_line(error), "a network that ONNX Runtime takes") from error
+    return open_session(data, LIMITS, as_written=True)
 
 
 def session_of(model: Any) -> Any:
@@ -262,7 +173,7 @@ def _check_shapes(network: Network) -> None:
         together = network.logits(images)
         alone = np.concatenate([network.logits(images[i : i + 1]) for i in range(3)])
     except Exception as error:  # ONNX Runtime raises a family of its own
-        fail(f"the network does not run: {_first_line(error)}", hint="not-a-network")
+        fail(f"the network does not run: {first_line(error)}", hint="not-a-network")
     expect(together.shape == (3, 4, SIZE, SIZE), "the network's output is not as it should be", got=together.shape,
            given="three images", expected=(3, 4, SIZE, SIZE), hint="image-in-logits-out")  # fmt: skip
     expect(bool(np.isfinite(together).all()), "the network answers NaN or infinity", given="three images of noise",
@@ -300,12 +211,3 @@ def _likeness(a: Array, b: Array) -> float:
     """Return the correlation of two networks' logits, apart from what a softmax does not see; -1 to 1."""
     a, b = (v - v.mean(axis=1, keepdims=True) for v in (a.astype(float), b.astype(float)))
     return float((a * b).sum() / max(1e-12, np.linalg.norm(a) * np.linalg.norm(b)))
-
-
-def _refuse(what: str, given: object, expected: str) -> InputError:
-    return InputError(what, given=given, expected=expected, fix="Export the network again with export_onnx.")
-
-
-def _first_line(error: Exception) -> str:
-    lines = str(error).splitlines()
-    return lines[0][:200] if lines else type(error).__name__
