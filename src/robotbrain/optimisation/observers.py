@@ -120,7 +120,22 @@ class Histogram:
         self.width = max(self.width, width)
 
 
-class PercentileObserver:
+class _HistogramObserver:
+    """What observers share that look at a histogram of all values."""
+
+    histogram: Histogram
+
+    def update(self, array: ArrayLike) -> None:
+        """Take in a batch of values, of any shape; NaN and infinity raise InputError."""
+        self.histogram.add(array)
+
+    def _seen(self) -> Histogram:
+        if not self.histogram.total:
+            raise _nothing()
+        return self.histogram
+
+
+class PercentileObserver(_HistogramObserver):
     """The range that holds the middle ``percentile`` per cent of the values.
 
     Half of what is cut lies at each end, to the resolution of the histogram and never inside the share that is to be
@@ -138,19 +153,13 @@ class PercentileObserver:
             )
         self.percentile, self.histogram = float(percentile), Histogram(bins)
 
-    def update(self, array: ArrayLike) -> None:
-        """Take in a batch of values, of any shape; NaN and infinity raise InputError."""
-        self.histogram.add(array)
-
     def range(self) -> tuple[float, float]:
         """Return (low, high).
 
         Raises:
             InputError: if nothing was seen.
         """
-        seen = self.histogram
-        if not seen.total:
-            raise _nothing()
+        seen = self._seen()
         cut = seen.total * (100.0 - self.percentile) / 200.0
         edges = np.arange(seen.bins + 1) * seen.width
         # From the most negative value to the largest: its bins, each with its two ends.
@@ -162,7 +171,7 @@ class PercentileObserver:
         return max(float(lower[first]), seen.low), min(float(upper[last]), seen.high)
 
 
-class EntropyObserver:
+class EntropyObserver(_HistogramObserver):
     """The range whose quantisation loses least information, by the Kullback-Leibler divergence.
 
     For every threshold T: cut the histogram of magnitudes at T (what lies beyond counts as T), spread the part below T
@@ -187,19 +196,13 @@ class EntropyObserver:
             )
         self.histogram, self.levels, self.stride = Histogram(bins), levels, stride
 
-    def update(self, array: ArrayLike) -> None:
-        """Take in a batch of values, of any shape; NaN and infinity raise InputError."""
-        self.histogram.add(array)
-
     def range(self) -> tuple[float, float]:
         """Return (-T, T), no wider on either side than what was seen.
 
         Raises:
             InputError: if nothing was seen.
         """
-        seen = self.histogram
-        if not seen.total:
-            raise _nothing()
+        seen = self._seen()
         counts = seen.magnitudes.astype(np.float64)
         used = int(np.flatnonzero(counts)[-1]) + 1 if counts.any() else 0
         if used <= self.levels:
