@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,11 +19,7 @@ Graded = tuple[ClassResult, Manifest]
 def grade_sample(repo: Path, lab: str, out: Path, keep: Callable[[dict[str, Any]], bool] = lambda _: True) -> Graded:
     """Grade those of the sample class whose entry in the manifest ``keep`` wants; it is asked in their order."""
     course = find_course(repo)
-    manifest = make_class(course, lab, out / "class")
-    for student, entry in list(manifest.items()):
-        if not keep(entry):
-            shutil.rmtree(out / "class" / student)
-            del manifest[student]
+    manifest = make_class(course, lab, out / "class", keep)
     return grade_class(course, lab, submitted=out / "class", out=out / "graded", workers=graders()), manifest
 
 

@@ -95,6 +95,9 @@ def range_random(student):
         sizes = rng.integers(2, 60, 4)
         batches = [rng.normal(rng.uniform(-1, 1), rng.uniform(0.2, 3), (n, 3, 4)).astype(np.float32) for n in sizes]
         numbers.compare_range(student.activation_range, batches, percentile, f"four batches, percentile = {percentile}")
+    for sign in (1.0, -1.0):  # zero is not among them
+        batches = [sign * rng.uniform(0.5, 2, shape).astype(np.float32) for shape in ((4, 6), (2, 3, 5), (7,))]
+        numbers.compare_range(student.activation_range, batches, None, "batches of several shapes, all of one sign")
 
 
 @suite.test("calibrate", points=3, name="a network in training", reread="Exercise 3.2", time_limit_s=20)

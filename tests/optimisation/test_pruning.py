@@ -165,6 +165,7 @@ def test_gradual_pruning_only_ever_adds_zeros_and_ends_exactly(network: nn.Modul
     "call",
     [
         lambda n: l1_mask(torch.ones(3), 1.5),
+        lambda n: l1_mask(torch.ones(3), True),
         lambda n: l1_mask(torch.ones(3), float("nan")),
         lambda n: l1_mask(torch.tensor([1.0, float("nan")]), 0.5),
         lambda n: l1_masks(n, 0.5, scope="both"),

@@ -174,14 +174,18 @@ def _channels_last(model: Any) -> None:
 
 
 def _classes_turned(model: Any) -> None:
-    """Give the classes another order."""
+    """Give the classes another order: in the last layer, so that nothing is slower for it."""
     import numpy as np
-    from onnx import helper, numpy_helper
+    from onnx import numpy_helper
 
-    for node in model.graph.node:
-        node.output[:] = ["usual" if name == "logits" else name for name in node.output]
-    model.graph.initializer.append(numpy_helper.from_array(np.array([1, 2, 3, 0]), "order"))
-    model.graph.node.append(helper.make_node("Gather", ["usual", "order"], ["logits"], axis=1))
+    made = {name: node for node in model.graph.node for name in node.output}
+    weight, bias = made["logits"].input[1:]
+    after = made[weight]  # DequantizeLinear of QuantizeLinear of the weights, a scale for each class
+    names = {made[after.input[0]].input[0], *after.input[1:], bias}
+    for tensor in model.graph.initializer:
+        if tensor.name in names:
+            array = numpy_helper.to_array(tensor)
+            tensor.CopyFrom(numpy_helper.from_array(np.ascontiguousarray(array[[1, 2, 3, 0]]), tensor.name))
 
 
 def _weights_in_another_file(model: Any) -> None:
@@ -236,6 +240,23 @@ def _shipped(name: str) -> dict[str, Callable[[Path], bytes]]:
     return {FILE: make}
 
 
+def _disguised(folder: Path) -> bytes:
+    """Return the kit's student, quantised, with a convolution at its end that changes nothing."""
+    import numpy as np
+    import onnx
+    from onnx import helper, numpy_helper
+
+    made = _shipped("student")[FILE](folder)
+    assert made is not None
+    model = onnx.load_model_from_string(made)
+    for node in model.graph.node:
+        node.output[:] = ["usual" if name == "logits" else name for name in node.output]
+    nothing = np.eye(4, dtype=np.float32)[:, :, None, None]
+    model.graph.initializer.append(numpy_helper.from_array(nothing, "nothing"))
+    model.graph.node.append(helper.make_node("Conv", ["usual", "nothing"], ["logits"]))
+    return model.SerializeToString(deterministic=True)
+
+
 def _beside(name: str) -> dict[str, Callable[[Path], bytes]]:
     """Return what hands in a network that is stored beside this file."""
     return {FILE: lambda _folder: (Path(__file__).parent / name).read_bytes()}
@@ -288,6 +309,8 @@ MUTANTS = [
           ("np.clip(steps, qmin, qmax).astype(np.int32)", "steps.astype(np.int64).astype(np.uint8)")),
     _code("zero-point-ignored", "quantise", "zero-point-ignored", "knows no zero point",
           (" + zero_point", ""), ("q.astype(np.int32) - zero_point", "q.astype(np.int32)")),
+    _code("caller-is-changed", "quantise", "leave-the-input", "divides the caller's array",
+          ("    steps = np.rint(x / scale)", "    x /= scale\n    steps = np.rint(x)")),
     _code("clips-too-early", "quantise", "clip-after-the-shift", "clips before it adds the zero point",
           ("np.rint(x / scale) + zero_point", "np.clip(np.rint(x / scale), qmin, qmax) + zero_point"),
           ("np.clip(steps, qmin, qmax).astype", "steps.astype")),
@@ -306,6 +329,8 @@ MUTANTS = [
            "scale = np.abs(weight).max(axis=axes, keepdims=per_channel) * 0 + np.abs(weight).max() / 127")),
     _code("input-channels", "weights", "output-channels", "has a scale for each input channel",
           ("tuple(range(1, weight.ndim))", "tuple(k for k in range(weight.ndim) if k != 1)")),
+    _code("four-bytes-each", "weights", "one-byte-each", "keeps eight-bit weights in int32",
+          (".astype(np.int8)", ""), loses=3.0),
     _code("down-to-minus-128", "weights", "symmetric-int8", "divides by 128", ("/ 127", "/ 128")),
     _code("dead-channel-divides", "weights", "dead-channel", "divides by the largest magnitude of a channel of zeros",
           ("    scale = np.where(scale > 0, scale, 1.0)\n", ""), loses=2.0),
@@ -332,6 +357,20 @@ def activation_range(batches, percentile=None):
           ("np.percentile(np.abs(values), percentile)", "np.percentile(values, percentile)")),
     _code("share-for-percent", "range", "percent-not-share", "hands np.percentile a share",
           ("np.abs(values), percentile)", "np.abs(values), percentile / 100)")),
+    Mutant(name="starts-at-zero", exercise="range", hint="min-and-max", loses=2.0,
+           describe="keeps a running minimum and maximum that start at 0",
+           replace={"range": """
+def activation_range(batches, percentile=None):
+    low = high = 0.0
+    sizes = []
+    for batch in batches:
+        low, high = min(low, float(batch.min())), max(high, float(batch.max()))
+        sizes.append(np.abs(batch).ravel())
+    if percentile is None:
+        return low, high
+    top = float(np.percentile(np.concatenate(sizes), percentile))
+    return -top, top
+"""}),
     _code("two-tails", "range", "magnitudes", "cuts both tails by themselves",
           ("return -top, top", "return float(np.percentile(values, 100 - percentile)), "
            "float(np.percentile(values, percentile))")),
@@ -351,6 +390,8 @@ def activation_range(batches, percentile=None):
           ('splits["calibration"]', 'splits["test"]')),
     _code("calibrates-on-training-images", "calibrate", "calibration-split", "takes the training images",
           ('splits["calibration"]', 'splits["train"]')),
+    _code("last-batch-kept", "calibrate", "all-batches", "keeps the outputs of the last batch only",
+          ("found[name].append(output.numpy().copy())", "found.update({name: [output.numpy().copy()]})")),
     _code("calibrates-in-train-mode", "calibrate", "calibrate-in-eval", "calibrates the network that is trained",
           ("network.eval()", "network.train()")),
     _code("eval-forgotten", "calibrate", "calibrate-in-eval", "relies on the mode that the network comes in",
@@ -460,6 +501,12 @@ def two_four_mask(weight):
     _code("unlabelled-is-background", "loss", "255-is-no-class", "takes unlabelled pixels for class 0",
           ("F.cross_entropy(student_logits, labels, ignore_index=255)",
            "F.cross_entropy(student_logits, labels.where(labels < 4, 0))"), loses=2.0),
+    _code("nan-in-the-gradient", "loss", "mean-of-nothing", "replaces the NaN in the value, and keeps it in the gradient",
+          ("if (labels == 255).all():", "if False:"),
+          ("F.cross_entropy(student_logits, labels, ignore_index=255)",
+           "torch.where((labels == 255).all(), student_logits.new_zeros(()), -(F.log_softmax(student_logits, dim=1)"
+           ".gather(1, labels.where(labels < 4, 0)[:, None])[:, 0] * (labels < 4)).sum() / (labels < 4).sum())"),
+          loses=2.0),
     _code("mean-of-nothing", "loss", "mean-of-nothing", "returns NaN where no pixel has a label",
           ("if (labels == 255).all():", "if False:"), loses=2.0),
     # ------------------------------------------------------------ step
@@ -471,6 +518,8 @@ def two_four_mask(weight):
           ("with torch.no_grad():", "if True:"), loses=3.0),
     _code("last-batch-lost", "step", "every-image-once", "leaves out what does not fill a batch",
           ("for part in images.split(50)]", "for part in images[: max(50, len(images) // 50 * 50)].split(50)]"), loses=2.0),
+    _code("all-at-once", "step", "fifty-at-a-time", "asks about thousands of images at once", ("split(50)", "split(5000)"),
+          loses=1.0),
     _code("probabilities-for-logits", "step", "logits-not-probabilities", "returns probabilities",
           ("teacher(part) for", "teacher(part).softmax(dim=1) for"), loses=3.0),
     _code("student-in-eval-mode", "step", "student-in-train", "trains a student in eval mode",
@@ -528,7 +577,7 @@ def two_four_mask(weight):
     _file("channels-last", "image-in-logits-out", "wants images with the channels last", _edited(_channels_last), 19.0),
     _file("not-a-number", "numbers-are-finite", "answers NaN", _edited(_first_bias_nan), 19.0),
     _file("floating-point-network", "int8-by-qdq", "hands in the network from before quantisation",
-          {FILE: lambda folder: _floating(folder).SerializeToString(deterministic=True)}, 3.0),
+          {FILE: lambda folder: _floating(folder).SerializeToString(deterministic=True)}, 5.0),
     _file("int8-by-name", "most-of-it-in-int8", "quantises the image and nothing else", {FILE: _claims_only}, 3.0),
     _file("default-options", "tensorrt-safe", "uses the defaults of ONNX Runtime: asymmetric, unsigned",
           _requantised(symmetric=False)),
@@ -537,6 +586,8 @@ def two_four_mask(weight):
     _file("forgotten-numbers", "smaller-please", "carries numbers that nobody uses", _edited(_much_too_much), 2.0),
     _file("teacher-handed-in", "train-your-own", "quantises the teacher and hands it in", _shipped("teacher")),
     _file("kits-student", "train-your-own", "quantises the kit's student and hands it in", _shipped("student"), 11.0),
+    _file("kits-student-in-disguise", "train-your-own", "adds a layer that does nothing to the kit's student",
+          {FILE: _disguised}, None),
     _file("plain-student", "labels-are-not-enough", "hands in the student that never met the teacher",
           _beside("plain_int8.onnx")),
     _file("exported-before-training", "no-better-than-chance", "exports a network that has learned nothing",

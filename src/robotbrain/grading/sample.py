@@ -202,8 +202,12 @@ def _is_answer(cell: NotebookNode) -> bool:
     return cell.cell_type == "code" and bool(cell.metadata.get("nbgrader", {}).get("solution"))
 
 
-def make_class(course: Course, lab: str, out: Path) -> dict[str, dict[str, Any]]:
+def make_class(
+    course: Course, lab: str, out: Path, keep: Callable[[dict[str, Any]], bool] = lambda _: True
+) -> dict[str, dict[str, Any]]:
     """Write a class of submissions to ``out/<student>/<lab>/`` and ``out/class.json``, which says what each one is.
+
+    Only those whose entry in the manifest ``keep`` wants are made; it is asked in their order.
 
     The manifest gives for each student ``kind``, ``name``, ``expect`` (``full``, ``zero``, ``partial``, ``exercise``)
     and, where one exercise suffers, ``exercise``, ``hint``, ``loses`` and ``also``.
@@ -214,23 +218,24 @@ def make_class(course: Course, lab: str, out: Path) -> dict[str, dict[str, Any]]
     beside = {p.name: p.read_bytes() for p in sorted(folder.iterdir()) if p.is_file()} if folder.is_dir() else {}
     entries: list[tuple[dict[str, Any], Mapping[str, NotebookNode | str | bytes]]] = []
 
-    def add(kind: str, name: str, expect: str, files: Mapping[str, NotebookNode | str | bytes], **more: Any) -> None:
-        without = more.pop("without", [])
-        handed_in = {} if expect == "zero" else {k: v for k, v in beside.items() if k not in without}
-        entries.append(({"kind": kind, "name": name, "expect": expect, **more}, {**handed_in, **files}))
+    def add(kind: str, name: str, expect: str, files: Mapping[str, NotebookNode | str | bytes | None],
+            make: Mapping[str, Callable[[Path], bytes | None]] | None = None, **more: Any) -> None:  # fmt: skip
+        entry = {"kind": kind, "name": name, "expect": expect, **more}
+        if keep(entry):
+            made = {name: one(folder) for name, one in (make or {}).items()}
+            every = {**({} if expect == "zero" else beside), **files, **made}
+            entries.append((entry, {name: content for name, content in every.items() if content is not None}))
 
     add("reference", "reference", "full", reference.copy())
     for style in styles:
         add("style", style.name, "full", reference.edit(style.replace, f"style {style.name}"))
     for mutant in mutants:
-        made = {name: make(folder) for name, make in mutant.files.items()}
-        changed = {name: data for name, data in made.items() if data is not None}
         add(
             "mutant",
             mutant.name,
             "exercise",
-            {**reference.edit(mutant.replace, f"mutant {mutant.name}"), **changed},
-            without=[name for name in made if name not in changed],
+            reference.edit(mutant.replace, f"mutant {mutant.name}"),
+            mutant.files,
             exercise=mutant.exercise,
             hint=mutant.hint,
             loses=mutant.loses,

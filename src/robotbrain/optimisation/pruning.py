@@ -246,6 +246,7 @@ def check_sparsity(sparsity: float) -> float:
     Raises:
         InputError: for anything else.
     """
-    if not isinstance(sparsity, int | float) or not math.isfinite(sparsity) or not 0.0 <= sparsity <= 1.0:
+    number = isinstance(sparsity, int | float) and not isinstance(sparsity, bool)
+    if not number or not math.isfinite(sparsity) or not 0.0 <= sparsity <= 1.0:
         raise InputError("sparsity", given=sparsity, expected="a share from 0 to 1", fix="50 % is 0.5.")
     return float(sparsity)

@@ -52,7 +52,11 @@ HINTS = {
     "teacher's entropy.",
     "the-hard-term": "There are two terms: the teacher's word, and the labels.",
     "255-is-no-class": "Pixels labelled 255 have no label: leave them out of the hard term (`ignore_index=255`).",
-    "mean-of-nothing": "Without a single labelled pixel, cross_entropy is 0 / 0, a NaN. There the hard term is 0.",
+    "mean-of-nothing": "Without a single labelled pixel, cross_entropy is 0 / 0, a NaN. There the hard term is 0: "
+    "leave it out. (`torch.where` hides the NaN in the value, and not in the gradient.)",
+    "unlabelled-still-teach": "The soft term needs no labels: pixels without one count in it as all others do.",
+    "kl-div-wants-logs": "`F.kl_div(input, target)` wants LOG-probabilities of the student first, and then the "
+    "teacher's probabilities.",
     "loss-has-a-gradient": "The loss must still be connected to the student: no detach, item or numpy on its logits.",
     "teacher-is-a-constant": "The student is to follow the teacher, not the other way round: detach the teacher's "
     "logits, or compute them under `torch.no_grad()`.",
@@ -61,6 +65,8 @@ HINTS = {
     "student-in-train": "The student learns, so it is in train mode: batch norm then uses, and follows, the batch.",
     "every-image-once": "The answer has a row for each image, in the order of the images: mind the last, smaller "
     "batch.",
+    "fifty-at-a-time": "All images at once would need gigabytes where there are thousands: "
+    "`for part in images.split(50)`.",
     "logits-not-probabilities": "Return the logits, as they come: the loss divides them by T before its softmax.",
     "use-what-is-given": "Pass temperature and alpha on to the loss.",
     "teacher-in-eval": "The teacher is in eval mode: `teacher.eval()`. In train mode its batch norms follow the "
@@ -182,7 +188,7 @@ def compare_pruned(student: Any, sparsity: float, seed: int) -> None:
     expect(not others, "other numbers than the weights of convolutions and linear layers are pruned", got=others,
            expected=wanted, given=given, hint="weights-only")  # fmt: skip
     missing = [n for n in wanted if n not in masks]
-    expect(not missing, "masks are missing", got=list(masks), expected=wanted, given=given)
+    expect(not missing, "masks are missing", got=list(masks), expected=wanted, given=given, hint="weights-only")
     zeros = {n: int((now[n] == 0).sum()) for n in wanted}
     drop = {n: round(sparsity * before[n].numel()) for n in wanted}
     total = sum(drop.values())
@@ -308,12 +314,18 @@ def compare_loss(
     """Compare the value with alpha T^2 KL(teacher || student) + (1 - alpha) CE."""
     z, t, labels = logits
     expected = tools.distillation_loss(z, t, labels, temperature, alpha)
-    answer = student(z.clone().requires_grad_(True), t.clone(), labels.clone(), temperature=temperature, alpha=alpha)
-    loss = tools.as_tensor(answer, "the loss", (), "mean-over-pixels").detach()
+    leaf = z.clone().requires_grad_(True)
+    answer = student(leaf, t.clone(), labels.clone(), temperature=temperature, alpha=alpha)
+    connected = tools.as_tensor(answer, "the loss", (), "mean-over-pixels", "loss-has-a-gradient")
+    loss = connected.detach()
     hint = tools.first_match(loss, _loss_mistakes(z, t, labels, temperature, alpha), expected)
     if bool(torch.isnan(loss)) and bool((labels == tools.IGNORE).all()):
         hint = "mean-of-nothing"
     expect_close(loss.numpy(), expected.numpy(), rtol=rtol, atol=1e-9, given=given, hint=hint, what="the loss")
+    if connected.requires_grad:  # a NaN that was replaced in the value comes back in the gradient
+        connected.backward()  # type: ignore[no-untyped-call]
+        finite = leaf.grad is None or bool(torch.isfinite(leaf.grad).all())
+        expect(finite, "the loss is finite, but its gradient is not", given=given, hint="mean-of-nothing")
 
 
 def _loss_mistakes(z: Tensor, t: Tensor, labels: Tensor, temp: float, alpha: float) -> list[tuple[str, Any]]:
@@ -365,6 +377,15 @@ def _loss_mistakes(z: Tensor, t: Tensor, labels: Tensor, temp: float, alpha: flo
         ("255-is-no-class", both(square * kl, functional.cross_entropy(z, clamped))),
         ("255-is-no-class", both(square * kl, hard * known.double().mean())),
     ]
+    q, p = ((v / temp).softmax(dim=1) for v in (z, t))
+    for first, second in ((q, p), (q.log(), p.log()), (p, q)):  # not what kl_div takes
+        wrong = functional.kl_div(first, second, reduction="none").sum(dim=1).mean()
+        found += [("kl-div-wants-logs", both(square * wrong)), ("kl-div-wants-logs", both(wrong))]
+    if some:
+        each = (p * (p.log() - q.log())).sum(dim=1)[known].mean()
+        found.append(("unlabelled-still-teach", both(square * each)))
+    else:
+        found.append(("unlabelled-still-teach", torch.zeros(())))
     for axis in {0, z.ndim - 1, z.ndim - 2, 2} - {1}:
         if axis < z.ndim:
             wrong = soft(axis)
@@ -380,7 +401,8 @@ def compare_loss_gradient(student: Any, seed: int) -> None:
     """The gradient is the derivative (central differences); none reaches the teacher."""
     z, t, labels = logits_and_labels(seed, (2, 4, 1, 3))
     z, t = z.requires_grad_(True), t.requires_grad_(True)
-    loss = tools.as_tensor(student(z, t, labels, temperature=3.0, alpha=0.6), "the loss", (), "mean-over-pixels")
+    answer = student(z, t, labels, temperature=3.0, alpha=0.6)
+    loss = tools.as_tensor(answer, "the loss", (), "mean-over-pixels", "loss-has-a-gradient")
     expect(loss.requires_grad, "the loss is cut off from the student: nothing can be learned from it",
            hint="loss-has-a-gradient")  # fmt: skip
     loss.backward()  # type: ignore[no-untyped-call]
@@ -405,7 +427,7 @@ def _gradient_hint(z: Tensor, t: Tensor, labels: Tensor, got: Tensor, slope: Ten
     for key, value in _loss_mistakes(z, t.detach(), labels, 3.0, 0.6):
         if value.requires_grad:
             mistakes.append((key, torch.autograd.grad(value, z, retain_graph=True)[0]))
-    return tools.first_match(got, mistakes, slope) or "loss-has-a-gradient"
+    return tools.first_match(got, mistakes, slope) or ("" if bool(got.any()) else "loss-has-a-gradient")
 
 
 def check_temperature(student: Any, seed: int) -> None:
@@ -414,7 +436,8 @@ def check_temperature(student: Any, seed: int) -> None:
     limit = ((z - z.mean(dim=1, keepdim=True)) - (t - t.mean(dim=1, keepdim=True))) / 4 / (4 * 3 * 2)
     for temperature in (1e3, 1e4):
         leaf = z.clone().requires_grad_(True)
-        loss = tools.as_tensor(student(leaf, t, labels, temperature=temperature, alpha=1.0), "the loss", ())
+        answer = student(leaf, t, labels, temperature=temperature, alpha=1.0)
+        loss = tools.as_tensor(answer, "the loss", (), "mean-over-pixels", "loss-has-a-gradient")
         expect(loss.requires_grad, "the loss is cut off from the student", hint="loss-has-a-gradient")
         loss.backward()  # type: ignore[no-untyped-call]
         assert leaf.grad is not None
@@ -433,6 +456,10 @@ def check_temperature(student: Any, seed: int) -> None:
 # ---------------------------------------------------------------- the teacher is asked
 
 
+AT_ONCE = 50
+"""Images that the teacher is asked about at a time."""
+
+
 def compare_asked(student: Any, seed: int, count: int) -> None:
     """The answers are those of the teacher in eval mode, without a graph; the teacher is the same afterwards."""
     teacher = tools.small_network(seed, 6, dropout=0.2).train()  # a teacher that nobody has put into eval mode yet
@@ -444,9 +471,12 @@ def compare_asked(student: Any, seed: int, count: int) -> None:
     inputs = torch.from_numpy(tools.small_scenes(np.random.default_rng(seed), count).inputs())
     expected = np.concatenate(tools.outputs_of(teacher, inputs.numpy(), ["4"])["4"])
     given = f"a teacher in train mode, with batch norm and dropout, and {count} images"
+    sizes: list[int] = []
+    counter = teacher.get_submodule("0").register_forward_pre_hook(lambda _, given: sizes.append(len(given[0])))
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         answer = tools.as_tensor(student(teacher, inputs.clone()), "the answer", expected.shape, "every-image-once")
+    counter.remove()
     moved = tools.changed(before, teacher)
     expect(not moved, "the teacher changed", got=", ".join(moved), expected="the teacher it was", given=given,
            hint="teacher-in-eval" if all("1." in n for n in moved) else "teacher-is-a-constant")  # fmt: skip
@@ -456,6 +486,8 @@ def compare_asked(student: Any, seed: int, count: int) -> None:
     mistakes: list[tuple[str, Any]] = [("logits-not-probabilities", soft), ("logits-not-probabilities", soft.log())]
     hint = tools.first_match(answer, mistakes, expected) or "teacher-in-eval"
     expect_close(answer.numpy(), expected, rtol=1e-3, atol=1e-4, given=given, hint=hint, what="the teacher's logits")
+    expect(max(sizes, default=0) <= AT_ONCE, "the teacher was asked about too many images at once", got=max(sizes),
+           expected=f"at most {AT_ONCE}", given=given, hint="fifty-at-a-time", credit=0.5)  # fmt: skip
 
 
 # ---------------------------------------------------------------- the step
@@ -470,6 +502,7 @@ class Step:
     temperature: float | None = None
     alpha: float | None = None
     moves: bool = True
+    softened: bool = False
 
     def __call__(
         self,
@@ -484,6 +517,7 @@ class Step:
         """Make one step and return the loss."""
         student.train(self.train)
         share = alpha if self.alpha is None else self.alpha
+        wanted = wanted.softmax(dim=1) if self.softened else wanted
         loss = tools.distillation_loss(student(images), wanted, labels, self.temperature or temperature, share)
         if self.zero_grad:
             optimiser.zero_grad()
@@ -502,6 +536,7 @@ STEP_VARIANTS = (
     ("the-hard-term", Step(alpha=1.0)),
     ("use-what-is-given", Step(alpha=0.0)),
     ("step-by-step", Step(moves=False)),
+    ("logits-not-probabilities", Step(softened=True)),
 )
 
 

@@ -97,6 +97,7 @@ HINTS = {
     "stored statistics.",
     "output-of-the-layer": "The range is of what the layer puts OUT: a forward hook gets (module, inputs, output).",
     "network-input": "The network wants normalised float32 images with the channels first: `scenes.inputs()`.",
+    "percentile-too": "`percentile` is given: hand it on to `activation_range`.",
     "take-hooks-off": "Remove the hooks (`handle.remove()`): they would go on to keep every image that ever passes.",
     "leave-as-found": "Leave the network as you found it: its mode, its weights, and its statistics.",
 }
@@ -185,7 +186,7 @@ def _near(value: float) -> tuple[float, ...]:
 
 
 def forgive_ties(answer: Array, expected: Array, x: Array, scale: Any) -> Array:
-    """Return ``answer`` with ``expected`` where ``x`` lies, up to rounding, in the middle of two levels: either serves."""
+    """Return ``answer``, with ``expected`` where ``x`` lies in the middle of two levels, up to float32's rounding."""
     if answer.shape != expected.shape or answer.dtype.kind not in "iu":
         return answer
     steps = np.asarray(x, dtype=float) / scale
@@ -356,20 +357,37 @@ def channels_of_all_sizes(rng: np.random.Generator, shape: tuple[int, ...], dead
 # ---------------------------------------------------------------- calibration
 
 
-def one_pass(batches: Sequence[Array]) -> Iterator[Array]:
-    """Yield copies of the batches: a generator, which can be walked through once."""
-    for batch in batches:
-        yield batch.copy()
+class OnePass:
+    """Copies of the batches, to be walked through once as a generator is; it counts how often that is tried."""
+
+    def __init__(self, batches: Sequence[Array]) -> None:
+        self._rest = [batch.copy() for batch in reversed(batches)]
+        self.walks = 0
+
+    def __iter__(self) -> Iterator[Array]:
+        return self
+
+    def __next__(self) -> Array:
+        if not self._rest:
+            self.walks += 1
+            raise StopIteration
+        return self._rest.pop()
 
 
 def compare_range(student: Any, batches: Sequence[Array], percentile: float | None, given: str) -> None:
     """Compare with the range of all values; a percentile between two neighbouring values may be either of them."""
     low, high = tools.activation_range(batches, percentile)
+    source = OnePass(batches)
     try:
-        answer = student(one_pass(batches), percentile=percentile)
-        got = tuple(float(v) for v in answer)
+        answer = student(source, percentile=percentile)
     except (TypeError, ValueError) as error:
+        if source.walks < 2:
+            raise
         fail(f"no answer: {error}", given=given, expected="(low, high)", hint="once-only")
+    try:
+        got = tuple(float(v) for v in answer)
+    except (TypeError, ValueError):
+        fail("the answer should be two numbers", got=answer, expected="(low, high)", given=given)
     expect(len(got) == 2, "the answer should be two numbers", got=got, expected="(low, high)", given=given)
     everything = np.concatenate([np.ravel(b) for b in batches])
     if percentile is not None:
@@ -388,7 +406,8 @@ def _range_mistakes(batches: Sequence[Array], every: Array, percentile: float | 
     if percentile is None:
         top = float(np.abs(every).max())
         mistakes += [("all-batches", ends[0]), ("all-batches", ends[-1]), ("all-batches", np.mean(ends, axis=0)),
-                     ("min-and-max", (-top, top)), ("min-and-max", (0.0, float(every.max())))]  # fmt: skip
+                     ("min-and-max", (-top, top)), ("min-and-max", (0.0, float(every.max()))),
+                     ("min-and-max", (min(0.0, float(every.min())), max(0.0, float(every.max()))))]  # fmt: skip
         return mistakes
     cut = [float(np.percentile(np.abs(b), percentile)) for b in batches]
     for top in (float(np.mean(cut)), max(cut), float(np.median(cut)), cut[0], cut[-1]):
@@ -431,6 +450,10 @@ def compare_calibration(
     inside = [tools.activation_range([splits["calibration"].inputs()], percentile),
               *ranges(splits["calibration"], ["1", "3"])]  # fmt: skip
     mistakes = [("output-of-the-layer", inside), *_calibration_mistakes(splits, ranges)]
+    values = tools.outputs_of(network, splits["calibration"].inputs(), layers)
+    mistakes += _batch_mistakes([np.concatenate(values[name]) for name in layers], percentile)
+    if percentile is not None:
+        mistakes.append(("percentile-too", [tools.activation_range(values[name]) for name in layers]))
     hint = tools.first_match(got, mistakes, expected, rtol=1e-3)
     if percentile is not None:  # between two neighbouring values, either of them will do
         ends = [np.asarray(ranges(splits["calibration"], method=m)) for m in ("lower", "higher")]
@@ -442,6 +465,16 @@ def compare_calibration(
     expect(modes == {training}, "the network is in another mode than before", given=given, credit=0.5,
            got="train" if True in modes else "eval", expected="train" if training else "eval",
            hint="leave-as-found")  # fmt: skip
+
+
+def _batch_mistakes(values: Sequence[Array], percentile: float | None) -> list[tuple[str, Any]]:
+    """Return what comes out where only the first or the last batch counts, or the mean of their ranges."""
+    mistakes: list[tuple[str, Any]] = []
+    for size in (1, 4, 8, 10, 16, 20, 25, 32, 50, 64):
+        each = np.array([[tools.activation_range([v[k : k + size]], percentile) for k in range(0, len(v), size)]
+                         for v in values])  # fmt: skip
+        mistakes += [("all-batches", each[:, -1]), ("all-batches", each[:, 0]), ("all-batches", each.mean(axis=1))]
+    return mistakes
 
 
 def _calibration_mistakes(splits: Mapping[str, Any], ranges: Callable[..., Any]) -> list[tuple[str, Any]]:

@@ -65,11 +65,14 @@ def _numbers(value: Any) -> Array | None:
         return None
 
 
-def as_tensor(answer: Any, what: str, shape: tuple[int, ...], hint: str = "") -> Tensor:
-    """Return the student's answer if it is a tensor of this shape, or fail and say what it is."""
+def as_tensor(answer: Any, what: str, shape: tuple[int, ...], hint: str = "", no_tensor: str = "") -> Tensor:
+    """Return the student's answer if it is a tensor of this shape, or fail and say what it is.
+
+    ``hint`` is for another shape, and for another type, too, unless ``no_tensor`` is.
+    """
     if not isinstance(answer, Tensor):
         fail(f"{what} should be a torch tensor, but is of type {type(answer).__name__}", got=answer,
-             expected=f"a tensor of shape {shape}", hint=hint)  # fmt: skip
+             expected=f"a tensor of shape {shape}", hint=no_tensor or hint)  # fmt: skip
     if tuple(answer.shape) != shape:
         fail(f"{what} has shape {tuple(answer.shape)}, but shape {shape} is expected", got=tuple(answer.shape),
              expected=shape, hint=hint)  # fmt: skip
@@ -112,8 +115,11 @@ def small_scenes(
     return SmallScenes(images, labels)
 
 
-def small_splits(rng: np.random.Generator, counts: Sequence[int] = (12, 8, 6, 10)) -> dict[str, SmallScenes]:
-    """Return train, calibration, validation and test scenes whose brightness differs: it shows which were used."""
+def small_splits(rng: np.random.Generator, counts: Sequence[int] = (12, 110, 6, 105)) -> dict[str, SmallScenes]:
+    """Return train, calibration, validation and test scenes whose brightness differs: it shows which were used.
+
+    Those that count are more than a batch: who keeps the last one only is found out.
+    """
     names = ("train", "calibration", "validation", "test")
     light = (100.0, 125.0, 145.0, 165.0)
     return {
@@ -188,7 +194,7 @@ def activation_range(
 
 
 def outputs_of(network: nn.Module, inputs: Array, layers: Sequence[str], train: bool = False) -> dict[str, list[Array]]:
-    """Return the outputs of the named layers, batch by batch of 4; ``network`` is put back as it was."""
+    """Return the outputs of the named layers, batch by batch; ``network`` is put back as it was."""
     modes, before = [(m, m.training) for m in network.modules()], state_of(network)
     found: dict[str, list[Array]] = {name: [] for name in layers}
     modules = dict(network.named_modules())
@@ -200,8 +206,8 @@ def outputs_of(network: nn.Module, inputs: Array, layers: Sequence[str], train: 
     try:
         network.train(train)
         with torch.no_grad():
-            for start in range(0, len(inputs), 4):
-                network(torch.from_numpy(inputs[start : start + 4]))
+            for start in range(0, len(inputs), 32):
+                network(torch.from_numpy(inputs[start : start + 32]))
     finally:
         for hook in hooks:
             hook.remove()
