@@ -27,8 +27,8 @@ assert np.abs(runs["fused"]() - torch_run()).max() < 1e-3 * np.abs(torch_run()).
 assert not (folder / "fog.onnx").exists()
 boards3 = [("nano-4gb", "MAXN"), ("orin-nano-8gb", "15W"), ("agx-orin-64gb", "MAXN")]
 both = [[predict(networks[n], d, mode=m, precision="fp16") for n in ("student", "teacher")] for d, m in boards3]
-assert all(b.macs > 10 * a.macs and b.latency_ms < 3 * a.latency_ms for a, b in both)
-assert all(len(b.kernels) <= len(a.kernels) + 6 for a, b in both)
+assert all(b.macs > 9 * a.macs and b.latency_ms < 2.05 * a.latency_ms for a, b in both)
+assert all(len(b.kernels) == len(a.kernels) + 2 for a, b in both)
 launch = lambda p: sum(k.launch_ms for k in p.kernels) / sum(k.total_ms for k in p.kernels)
 assert launch(both[0][1]) < launch(both[1][1]) < launch(both[2][1]) and min(map(launch, both[1])) > 0.6
 assert large["teacher"] and abs(found["nano-4gb", "fp16"].macs / (75 * both[0][1].macs) - 1) < 0.01
@@ -49,7 +49,7 @@ slow, half, quick = drives.values()
 assert not slow.success and "did not arrive" in slow.reason and half.success and quick.success
 assert 0.2 < slow.control_hz / 20 < 0.32 and 400 < np.median(slow.camera_age_ms) < 500
 assert 0.4 < np.median(quick.camera_age_ms) / np.median(half.camera_age_ms) < 0.62
-assert 50 < np.median(quick.perception_ms) < 65 and 1.5 < profile.network_ms(quantised.path, "int8", size) < 2.5
+assert 55 < np.median(quick.perception_ms) < 66 and 2 < profile.network_ms(quantised.path, "int8", size) < 3
 """
 
 
