@@ -6,12 +6,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from robotbrain.grading import mutation
+import nbformat
+
+from robotbrain.grading import Suite, mutation
 from robotbrain.grading.classroom import ClassResult, grade_class
 from robotbrain.grading.course import find_course
 from robotbrain.grading.sample import make_class
 from tests.conftest import graders
 
+KINDS = ("code", "markdown")
 Manifest = dict[str, dict[str, Any]]
 Graded = tuple[ClassResult, Manifest]
 
@@ -49,3 +52,16 @@ def check_secrets(graded: Graded, lab: str, *secrets: str) -> None:
         page = next((result.feedback / row.student / lab).glob("*.html")).read_text(encoding="utf-8")
         for secret in (*secrets, "student.rng", "autograder/hidden"):
             assert secret not in page, f"{row.student}: {secret}"
+
+
+def check_points(repo: Path, lab: str, suite: Suite, automatic: int, by_hand: int, titles: bool = True) -> None:
+    """Points (and titles) of the exercises are the same in the notebook and in the tests."""
+    notebook = nbformat.read(repo / "solutions" / lab / f"{lab}.ipynb", as_version=4)
+    graded = [c for c in notebook.cells if c.metadata.get("nbgrader", {}).get("grade")]
+    points = {kind: sum(c.metadata.nbgrader.points for c in graded if c.cell_type == kind) for kind in KINDS}
+    assert points["code"] == sum(e.points for e in suite.exercises.values()) == automatic
+    assert points["markdown"] == by_hand
+    text = "\n".join(c.source for c in notebook.cells)
+    for exercise in suite.exercises.values() if titles else ():
+        number, _, name = exercise.title.partition(" ")
+        assert f"### Exercise {number}: {name[0].lower()}{name[1:]} ({exercise.points:g} points)" in text

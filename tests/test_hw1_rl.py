@@ -55,16 +55,7 @@ def test_the_released_lab_holds_no_answer_no_hidden_test_and_no_policy(repo: Pat
 
 
 def test_points_agree_between_notebook_and_tests(repo: Path, suite: Suite) -> None:
-    notebook = nbformat.read(repo / "solutions" / LAB / f"{LAB}.ipynb", as_version=4)
-    graded = [c for c in notebook.cells if c.metadata.get("nbgrader", {}).get("grade")]
-    automatic = sum(c.metadata.nbgrader.points for c in graded if c.cell_type == "code")
-    by_hand = sum(c.metadata.nbgrader.points for c in graded if c.cell_type == "markdown")
-    assert automatic == sum(e.points for e in suite.exercises.values()) == 92
-    assert by_hand == 8
-    text = "\n".join(c.source for c in notebook.cells)
-    for exercise in suite.exercises.values():
-        number, _, name = exercise.title.partition(" ")
-        assert f"### Exercise {number}: {name[0].lower()}{name[1:]} ({exercise.points:g} points)" in text
+    classes.check_points(repo, LAB, suite, automatic=92, by_hand=8)
 
 
 def test_nothing_is_trained_while_grading(repo: Path) -> None:

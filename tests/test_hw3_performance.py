@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import nbformat
 import numpy as np
 import pytest
 
@@ -47,12 +46,7 @@ def test_the_released_lab_holds_no_answer_and_no_hidden_test(repo: Path) -> None
 
 
 def test_points_agree_between_notebook_and_tests(repo: Path, suite: Suite) -> None:
-    notebook = nbformat.read(repo / "solutions" / LAB / f"{LAB}.ipynb", as_version=4)
-    graded = [c for c in notebook.cells if c.metadata.get("nbgrader", {}).get("grade")]
-    automatic = sum(c.metadata.nbgrader.points for c in graded if c.cell_type == "code")
-    by_hand = sum(c.metadata.nbgrader.points for c in graded if c.cell_type == "markdown")
-    assert automatic == sum(e.points for e in suite.exercises.values()) == 90
-    assert by_hand == 10
+    classes.check_points(repo, LAB, suite, automatic=90, by_hand=10)
 
 
 def test_every_hint_and_every_mutant_is_of_use(repo: Path, suite: Suite) -> None:

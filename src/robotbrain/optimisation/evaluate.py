@@ -60,26 +60,12 @@ def onnx_session(path: str | Path, *, optimise: bool = True, threads: int = 1) -
     Raises:
         InputError: for a file that is missing or that ONNX Runtime cannot load.
     """
-    import onnxruntime
+    from robotbrain.jetson.engine.ort import load_session
 
     file = Path(path)
     if not file.is_file():
         raise InputError("model", given=str(path), expected="the path of an ONNX file", fix="Check the path.")
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads
-    options.inter_op_num_threads = 1
-    options.log_severity_level = 3
-    if not optimise:
-        options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
-    try:
-        return onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # ONNX Runtime raises a family of its own, without a common public base
-        raise InputError(
-            "model",
-            given=str(path),
-            expected="a valid ONNX file",
-            fix=f"ONNX Runtime says: {str(error).splitlines()[0][:200]}",
-        ) from error
+    return load_session(file, threads=threads, optimise=optimise)
 
 
 def predict(model: nn.Module | str | Path | Any, images: NDArray[np.uint8], *, optimise: bool = True) -> NDArray[Any]:

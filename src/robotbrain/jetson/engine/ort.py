@@ -18,6 +18,37 @@ if TYPE_CHECKING:
     from types import TracebackType
 
 
+def load_session(path: Path, *, threads: int = 1, optimise: bool = True) -> Any:
+    """Return an ONNX Runtime session for a file.
+
+    Args:
+        path: of the file, which exists.
+        threads: that one inference may use. With one, results do not depend on the machine's core count.
+        optimise: False computes the graph as it is written (``ORT_DISABLE_ALL``).
+
+    Raises:
+        InputError: ONNX Runtime cannot load it.
+    """
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.inter_op_num_threads = 1
+    options.log_severity_level = 3
+    if not optimise:
+        options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
+    try:
+        # By path, not by content: the weights may lie in a file beside it, as torch exports them by default.
+        return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # ONNX Runtime raises a family of its own, without a common public base
+        raise InputError(
+            "model",
+            given=str(path),
+            expected="a valid ONNX file",
+            fix=f"ONNX Runtime says: {str(error).splitlines()[0][:200]}",
+        ) from error
+
+
 class OnnxEngine:
     """An inference engine over an ONNX file with one float32 image input and one output.
 
@@ -46,8 +77,6 @@ class OnnxEngine:
         charged_as: str | Path | None = None,
         precision: str = PRECISION,
     ) -> None:
-        import onnxruntime
-
         path = Path(model)
         if not path.is_file():
             raise InputError(
@@ -56,21 +85,7 @@ class OnnxEngine:
                 expected="the path of an ONNX file",
                 fix="Train it with `robotbrain train segmentation`, or check the path.",
             )
-        options = onnxruntime.SessionOptions()
-        # One thread: the nets are small, and results must not depend on the machine's core count.
-        options.intra_op_num_threads = 1
-        options.inter_op_num_threads = 1
-        options.log_severity_level = 3
-        try:
-            # By path, not by content: the weights may lie in a file beside it, as torch exports them by default.
-            self._session: Any = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-        except Exception as error:  # ONNX Runtime raises a family of its own, without a common public base
-            raise InputError(
-                "model",
-                given=str(path),
-                expected="a valid ONNX file",
-                fix=f"ONNX Runtime says: {str(error).splitlines()[0][:200]}",
-            ) from error
+        self._session: Any = load_session(path)
         inputs = self._session.get_inputs()
         if [value.type for value in inputs] != ["tensor(float)"]:
             raise InputError(
