@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint format lab labs train bench profiles proof-drive proof-devices proof-bottlenecks proof-reach proof-velocity proof-gap conformance-ros conformance-isaaclab conformance-tensorrt proof-optimisation mutation-test clean
+.PHONY: help install demo test lint format lab labs book train bench profiles proof-drive proof-devices proof-bottlenecks proof-reach proof-velocity proof-gap conformance-ros conformance-isaaclab conformance-tensorrt proof-optimisation mutation-test clean
 
 help:  ## Show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-15s %s\n", $$1, $$2}'
@@ -38,6 +38,10 @@ format: $(STAMP)  ## Put code and notebooks into canonical form
 
 lab: $(STAMP)  ## Open JupyterLab on the course
 	$(BIN)/robotbrain lab
+
+book: $(STAMP)  ## Make a static site of the course, outputs included (five minutes the first time)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[book]"
+	$(BIN)/python book/build.py
 
 labs: $(STAMP)  ## Generate labs/ from solutions/
 	$(BIN)/robotbrain generate
