@@ -93,10 +93,7 @@ profiles: $(STAMP)  ## Calibrate the Jetson twin and write the reference profile
 	$(BIN)/robotbrain jetson reference
 
 mutation-test: $(STAMP)  ## Test the tests of the labs with named wrong solutions
-	$(BIN)/robotbrain mutation-test lab_integration --jobs 2
-	$(BIN)/robotbrain mutation-test hw1_rl --jobs 2
-	$(BIN)/robotbrain mutation-test hw2_optimisation --jobs 2
-	$(BIN)/robotbrain mutation-test hw3_performance --jobs 2
+	$(BIN)/robotbrain mutation-test --all --jobs 2
 
 bench: $(STAMP)  ## Run the benchmarks; each prints one table
 	$(BIN)/python benchmarks/ros_rate.py

@@ -7,6 +7,7 @@ from pathlib import Path
 from nbgrader.converters import GenerateAssignment
 
 from robotbrain.grading.nbgrader_plugins import CanonicalForm, HealingExporter, ResilientExecute
+from robotbrain.grading.reports.exporter import ATTRIBUTES, TAGS, FeedbackExporter, harmless_html
 
 c = get_config()
 
@@ -38,6 +39,16 @@ c.Autograde.autograde_preprocessors = [
     "nbgrader.preprocessors.CheckCellMetadata",
 ]
 c.OverwriteCells.add_missing_cells = True
+
+# What students get, also by formgrader's buttons; and what formgrader shows the teacher runs no script of a student's.
+c.GenerateFeedback.exporter_class = FeedbackExporter
+c.GenerateFeedback.preprocessors = []  # the page reads the gradebook itself
+c.HTMLExporter.preprocessors = ["nbconvert.preprocessors.sanitize.SanitizeHTML"]
+c.HTMLExporter.filters = {"strip_files_prefix": harmless_html}  # the last thing its template does to Markdown
+c.SanitizeHTML.tags = TAGS
+c.SanitizeHTML.attributes = ATTRIBUTES
+c.SanitizeHTML.strip = True
+c.SanitizeHTML.sanitized_output_types = {"text/html"}  # Markdown outputs become HTML after this: shown as text
 
 # A release is stored like every other notebook of the repository: `labs/` is compared byte by byte.
 c.GenerateAssignment.preprocessors = [*GenerateAssignment.preprocessors.default_args[0], CanonicalForm]

@@ -22,7 +22,14 @@ def need(condition: object, reason: str) -> None:
     pytest.skip(reason)
 
 
-SLOW_FILES = ("test_hw1_rl.py", "test_hw2_optimisation.py", "test_lab_integration.py", "test_hw3_performance.py")
+SLOW_FILES = (
+    "test_hw1_rl.py",
+    "test_hw2_optimisation.py",
+    "test_lab_integration.py",
+    "test_hw3_performance.py",
+    "test_labs_remote_a.py",
+    "test_attacks.py",
+)
 """Files that take minutes: with two workers (pytest-xdist) they must not be left for the end."""
 
 

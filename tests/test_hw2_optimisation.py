@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import contextlib
 import copy
 import warnings
 from collections.abc import Callable, Iterator
@@ -17,15 +16,17 @@ import torch
 from torch import nn
 
 from robotbrain.errors import InputError
-from robotbrain.grading import CheckFailure, Lab, Suite, load_hidden_suite
+from robotbrain.grading import CheckFailure, Suite, load_hidden_suite
 from robotbrain.grading.course import find_course, release_differences
 from robotbrain.grading.sample import Reference, load_mutants
+from robotbrain.grading.student import Student
 from robotbrain.grading.suites import hw2_optimisation_judge as judge
 from robotbrain.grading.suites import hw2_optimisation_learning as learning
 from robotbrain.grading.suites import hw2_optimisation_network as network_file
 from robotbrain.grading.suites import hw2_optimisation_numbers as numbers
+from robotbrain.grading.suites import hw2_optimisation_probes as probes
 from robotbrain.grading.suites import hw2_optimisation_tools as tools
-from tests import classes
+from tests import classes, far
 
 LAB = "hw2_optimisation"
 FILE = "student_int8.onnx"
@@ -39,6 +40,16 @@ def suite(repo: Path) -> Suite:
 @pytest.fixture(scope="module")
 def solution(repo: Path) -> Any:
     return nbformat.read(repo / "solutions" / LAB / f"{LAB}.ipynb", as_version=4)
+
+
+@pytest.fixture(scope="module")
+def beside(repo: Path) -> Path:
+    """The files that are handed in with the reference."""
+    return repo / "autograder" / "reference" / LAB
+
+
+HANDED_IN = Student({"STUDENT": FILE}, LAB, frozenset())
+"""A student who hands in what lies in the working directory."""
 
 
 @pytest.fixture
@@ -100,7 +111,7 @@ def test_every_hint_and_every_mutant_is_of_use(repo: Path, suite: Suite) -> None
     assert len(mutants) >= 45 and len(styles) == 3
     assert {m.hint for m in mutants} <= set(suite.hints)
     assert {m.exercise for m in mutants} == set(suite.exercises)
-    parts = ("", "_judge", "_learning", "_network", "_numbers", "_tools")
+    parts = ("", "_judge", "_learning", "_network", "_numbers", "_probes", "_tools")
     files = [f"src/robotbrain/grading/suites/{LAB}{part}.py" for part in parts]
     tests = "".join((repo / name).read_text(encoding="utf-8") for name in [*files, f"autograder/hidden/{LAB}.py"])
     assert [key for key in suite.hints if tests.count(f'"{key}"') < 2] == []
@@ -127,13 +138,13 @@ def test_our_loss_is_that_of_the_library_and_its_slope_is_a_slope() -> None:
     from robotbrain.optimisation.distillation import distillation_loss
 
     for seed, unknown in ((0, 0.0), (1, 0.4), (2, 1.0)):
-        logits = learning.logits_and_labels(seed, unknown=unknown)
+        logits = learning.logits_and_labels(np.random.default_rng(seed), unknown=unknown)
         for temperature, alpha in ((1.0, 0.5), (4.0, 0.7), (20.0, 1.0)):
             ours = tools.distillation_loss(*logits, temperature, alpha)
             assert float(ours) == pytest.approx(
                 float(distillation_loss(*logits, temperature=temperature, alpha=alpha)), rel=1e-9
             )
-    student, teacher, labels = learning.logits_and_labels(3, (2, 4, 1, 3))
+    student, teacher, labels = learning.logits_and_labels(np.random.default_rng(3), (2, 4, 1, 3))
 
     def loss(z: torch.Tensor) -> torch.Tensor:
         return tools.distillation_loss(z, teacher, labels, 3.0, 0.6)
@@ -154,8 +165,9 @@ def test_our_score_is_that_of_the_library() -> None:
     from robotbrain.optimisation.evaluate import mean_iou
 
     for seed in range(4):
-        scenes = tools.small_scenes(np.random.default_rng(seed), 6)
-        network = tools.small_network(seed).eval()
+        rng = np.random.default_rng(seed)
+        scenes = tools.small_scenes(rng, 6)
+        network = tools.small_network(rng).eval()
         logits = np.concatenate(tools.outputs_of(network, scenes.inputs(), ["4"])["4"])
         ours = tools.iou(tools.confusion(scenes.labels, logits.argmax(axis=1)))
         assert ours == pytest.approx(mean_iou(network, Scenes(scenes.images, scenes.labels)).mean, abs=1e-9)
@@ -182,50 +194,48 @@ def test_the_bound_covers_the_drop_as_often_as_it_says() -> None:
     assert 0.89 <= covered / 200 <= 0.99
 
 
+def student(**answers: Any) -> Student:
+    """Return a student with these answers."""
+    return Student(answers, LAB, frozenset())
+
+
+OURS = student(
+    **{name: getattr(tools, name) for name in ("choose_scale", "quantise", "dequantise", "quantise_weights")},
+    **{name: getattr(tools, name) for name in ("activation_range", "magnitude_mask", "distillation_loss")},
+    distil_step=learning.Step(),
+)
+
+
 def right_answers() -> Iterator[tuple[Callable[..., None], tuple[Any, ...]]]:
-    rng = np.random.default_rng(5)
     for low, high in ((-1, 3), (0.5, 3), (-3, -1), (0, 0)):
         for symmetric in (False, True):
-            yield numbers.compare_scale, (tools.choose_scale, low, high, symmetric)
-    yield numbers.check_round_trip, (tools.quantise, tools.dequantise, 0.02, 100)
+            yield numbers.compare_scale, (low, high, symmetric)
+    yield numbers.check_round_trip, (0.02, 100)
     for seed in range(5):
         rng = np.random.default_rng(seed)
-        yield numbers.check_half_a_step, (tools.quantise, tools.dequantise, rng)
+        yield numbers.check_half_a_step, (rng,)
         weight = numbers.channels_of_all_sizes(rng, (5, 4, 3, 3), dead=bool(seed % 2))
-        yield numbers.compare_weights, (tools.quantise_weights, weight, bool(seed % 3), "")
+        yield numbers.compare_weights, (weight, bool(seed % 3), "")
         batches = [rng.normal(0, 1 + k, (7, 5)) for k in range(3)]
-        yield numbers.compare_range, (tools.activation_range, batches, [None, 90.0][seed % 2], "")
-        yield learning.compare_mask, (tools.magnitude_mask, torch.from_numpy(rng.normal(0, 1, (6, 5))), 0.3, "")
-        yield learning.compare_loss, (tools.distillation_loss, learning.logits_and_labels(seed), 3.0, 0.4, "")
-        yield learning.compare_loss_gradient, (tools.distillation_loss, seed)
-        yield learning.check_temperature, (tools.distillation_loss, seed)
-        yield learning.compare_steps, (learning.Step(), seed)
+        yield numbers.compare_range, (batches, [None, 90.0][seed % 2], "")
+        yield learning.compare_mask, (torch.from_numpy(rng.normal(0, 1, (6, 5))), 0.3, "")
+        yield learning.compare_loss, (learning.logits_and_labels(rng), 3.0, 0.4, "")
+        yield learning.compare_loss_gradient, (rng,)
+        yield learning.check_temperature, (rng,)
+        yield learning.compare_steps, (rng,)
 
 
 def test_random_tests_pass_our_own_answers_whatever_the_seed() -> None:
     for test, arguments in right_answers():
-        test(*arguments)
+        test(OURS, *arguments)
 
 
 def test_typical_mistakes_of_a_step_can_be_told_apart() -> None:
-    for seed, steps in ((6, 3), (100, 4), (101, 4)):  # the first is the visible test's
+    for seed, steps in ((6, 3), (100, 4), (101, 4)):
         for key, step in learning.STEP_VARIANTS:
             with pytest.raises(CheckFailure) as caught:
-                learning.compare_steps(step, seed, steps)
+                learning.compare_steps(student(distil_step=step), np.random.default_rng(seed), steps)
             assert caught.value.hint == key
-
-
-def scored(notebook: Any, exercise: str, suite: Suite) -> Any:
-    """Return the report on one exercise of a notebook, hidden tests included, in this process."""
-    namespace: dict[str, Any] = {}
-    exec(PREAMBLE, namespace)
-    for cell in notebook.cells:
-        if cell.metadata.get("nbgrader", {}).get("solution") and cell.cell_type == "code":
-            with contextlib.suppress(NotImplementedError):  # a cell without an answer
-                exec(compile(cell.source, cell.id, "exec"), namespace)
-    lab = Lab(LAB, namespace=namespace)
-    lab._complete = suite
-    return lab.score(exercise, hidden=True).report
 
 
 PREAMBLE = """
@@ -235,33 +245,38 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 from robotbrain.jetson import predict
+STUDENT = "student_int8.onnx"
 """
 
 
-def test_mutants_of_answers_lose_their_points_styles_get_all_and_the_stub_none(repo: Path, suite: Suite) -> None:
-    course = find_course(repo)
-    mutants, styles = load_mutants(course, LAB)
-    reference = Reference(course, LAB)
-    problems = []
-    for mutant in mutants:
-        if mutant.files:
-            continue
-        (notebook,) = reference.edit(mutant.replace, mutant.name).values()
-        report = scored(notebook, mutant.exercise, suite)
-        lost = report.points - report.earned
-        hints = {result.hint_key for result in report.results}
-        if lost <= 0 or mutant.hint not in hints or (mutant.loses is not None and lost != pytest.approx(mutant.loses)):
-            problems.append(f"{mutant.name} loses {lost:g} of {mutant.loses}; hints {hints}, not {mutant.hint}")
+def test_answers_are_graded_alike_near_and_far(repo: Path, suite: Suite, beside: Path) -> None:
+    reference = Reference(find_course(repo), LAB)
+    mutants, styles = load_mutants(find_course(repo), LAB)
+    trials = far.Trials(suite, PREAMBLE, beside)
+    trials.expect_full(reference.edit({}, "reference"), "reference", suite.exercises)
+    trials.expect_nothing(reference.stubs, "stub", [e for e in suite.exercises if e != "student"])
     for style in styles:
-        (notebook,) = reference.edit(style.replace, style.name).values()
-        problems += [
-            f"{style.name} loses points in {exercise}"
-            for exercise in suite.exercises
-            if exercise != "student" and not scored(notebook, exercise, suite).full
-        ]
-    (stub,) = reference.stubs.values()
-    problems += [f"the stub earns points in {e}" for e in suite.exercises if scored(stub, e, suite).earned]
-    assert problems == []
+        trials.expect_full(reference.edit(style.replace, style.name), style.name,
+                           [e for e in suite.exercises if e in style.replace])  # fmt: skip
+    for mutant in mutants:
+        if not mutant.files:
+            trials.expect_loss(reference.edit(mutant.replace, mutant.name), mutant)
+    assert trials.problems == []
+
+
+# Of the wrong files, those that are made and judged quickly; `make mutation-test` grades all.
+QUICK_FILES = ("file-not-handed-in", "file-cut-off", "weights-elsewhere", "loops-for-ever", "channels-last",
+               "not-a-number", "floating-point-network", "int8-by-name", "forgotten-numbers", "plain-student",
+               "exported-before-training", "classes-in-another-order", "calibrated-in-the-dark")  # fmt: skip
+
+
+@pytest.mark.parametrize("name", QUICK_FILES)
+def test_wrong_files_lose_their_points(repo: Path, suite: Suite, beside: Path, tmp_path: Path, name: str) -> None:
+    reference = Reference(find_course(repo), LAB)
+    mutant = next(m for m in load_mutants(find_course(repo), LAB)[0] if m.name == name)
+    trials = far.Trials(suite, PREAMBLE, far.with_files(beside, mutant, tmp_path), near=False)
+    trials.expect_loss(reference.edit(mutant.replace, mutant.name), mutant)
+    assert trials.problems == []
 
 
 def test_a_value_between_two_levels_may_be_rounded_in_either_precision() -> None:
@@ -270,9 +285,11 @@ def test_a_value_between_two_levels_may_be_rounded_in_either_precision() -> None
     single, double = (np.rint(x / kind(0.013)).astype(np.int32) for kind in (np.float32, np.float64))
     assert (single != double).any()
     for answer in (single, double):
-        numbers.compare_quantise(lambda *_, answer=answer, **__: answer, x, 0.013, 0, -127, 127, "")
+        mine = student(quantise=lambda *_, answer=answer, **__: answer)
+        numbers.compare_quantise(mine, x, 0.013, 0, -127, 127, "")
+    wrong = student(quantise=lambda *_, **__: double + (x > 0))
     with pytest.raises(CheckFailure):
-        numbers.compare_quantise(lambda *_, **__: double + (x > 0), x + np.float32(0.001), 0.013, 0, -127, 127, "")
+        numbers.compare_quantise(wrong, x + np.float32(0.001), 0.013, 0, -127, 127, "")
 
 
 def test_a_wrong_type_is_no_second_walk() -> None:
@@ -283,9 +300,9 @@ def test_a_wrong_type_is_no_second_walk() -> None:
         return values.min(), values.max()
 
     with pytest.raises(ValueError, match="inhomogeneous"):  # the student's own error is reported as such
-        numbers.compare_range(inhomogeneous, batches, None, "")
+        numbers.compare_range(student(activation_range=inhomogeneous), batches, None, "")
     with pytest.raises(CheckFailure) as caught:
-        numbers.compare_range(lambda source, percentile=None: 3.0, batches, None, "")
+        numbers.compare_range(student(activation_range=lambda source, percentile=None: 3.0), batches, None, "")
     assert caught.value.hint == ""
 
 
@@ -314,7 +331,7 @@ def test_what_part_1_says_of_zeros_teacher_and_loss_is_true() -> None:
         zeros = int((network[0].weight == 0).sum())
         assert zeros == round(0.2 * network[0].weight.numel())
         optimiser = torch.optim.Adam(network.parameters(), lr=1e-3)
-        before = tools.state_of(teacher)
+        before = probes.state_of(teacher)
         network.train()
         teacher.train(not teacher_eval)
         for _ in range(3):
@@ -328,7 +345,8 @@ def test_what_part_1_says_of_zeros_teacher_and_loss_is_true() -> None:
             loss.backward()  # type: ignore[no-untyped-call]
             optimiser.step()
         assert int((network[0].weight == 0).sum()) == 0  # a: no zero is left
-        return tools.flat(network), tools.changed(before, teacher), teacher[0].weight.grad
+        moved = tools.changed(before, probes.state_of(teacher))
+        return tools.flat(probes.state_of(network)), moved, teacher[0].weight.grad
 
     right, moved, gradient = outline()
     assert not moved and gradient is None
@@ -359,7 +377,7 @@ def test_zeros_change_neither_the_latency_nor_the_size(handed_in: Path) -> None:
     import onnx
     from onnx import numpy_helper
 
-    network = network_file.load(FILE)
+    network = network_file.load(HANDED_IN)
     before = judge.predict_of(network).latency_ms
     model = copy.deepcopy(network.model)
     for tensor in model.graph.initializer:
@@ -367,7 +385,7 @@ def test_zeros_change_neither_the_latency_nor_the_size(handed_in: Path) -> None:
         if array.ndim == 4:
             tensor.CopyFrom(numpy_helper.from_array(np.zeros_like(array), tensor.name))
     onnx.save(model, FILE)
-    pruned = network_file.load(FILE)
+    pruned = network_file.load(HANDED_IN)
     assert judge.predict_of(pruned).latency_ms == before and pruned.size_bytes == network.size_bytes
 
 
@@ -378,8 +396,8 @@ WORLDS = 40
 
 
 def test_the_reference_keeps_within_the_budget_with_a_margin(handed_in: Path) -> None:
-    network = network_file.load(FILE)
-    judge.check_int8(FILE)
+    network = network_file.load(HANDED_IN)
+    judge.check_int8(HANDED_IN)
     assert judge.predict_of(network).latency_ms < 0.97 * judge.BUDGET["latency_ms"]
     assert network.size_bytes < 0.97 * judge.BUDGET["bytes"]
     drop, upper = drop_of(network)
@@ -393,29 +411,61 @@ def test_teacher_plain_student_and_floating_point_do_not(repo: Path, handed_in: 
     for check, hint in ((judge.check_latency, "int8-by-qdq"), (judge.check_size, "smaller-please"),
                         (judge.check_int8, "int8-by-qdq")):  # fmt: skip
         with pytest.raises(CheckFailure) as caught:
-            check(FILE)
+            check(HANDED_IN)
         assert caught.value.hint == hint
     plain = repo / "autograder" / "mutants" / LAB / "plain_int8.onnx"
     handed_in.write_bytes(plain.read_bytes())
-    drop, upper = drop_of(network_file.load(FILE))
+    drop, upper = drop_of(network_file.load(HANDED_IN))
     assert drop - judge.BUDGET["drop"] > 1.5 * (upper - drop)  # no luck of the draw saves it
 
 
 def drop_of(network: Any) -> tuple[float, float]:
-    scenes = judge._scenes(31_000_000, WORLDS)
-    counts = judge.counts_by_world(scenes.labels, network.logits(scenes.inputs()))
-    return judge.drop_with_bound(judge._teacher_counts(31_000_000, WORLDS), counts)
+    seeds = range(31_000_000, 31_000_000 + WORLDS)
+    return judge.drop_with_bound(judge._teachers(seeds), judge._counts(network, seeds))
+
+
+def test_work_that_nobody_needs_and_cheap_layers_make_no_network_more_quantised(handed_in: Path) -> None:
+    import onnx
+    from onnx import helper, numpy_helper
+
+    network = network_file.load(HANDED_IN)
+    low, every = network_file.quantised_work(network.model)
+    assert 0.9 * every <= low <= every
+
+    floating = copy.deepcopy(judge.without_quantisers(network.model))
+    assert network_file.quantised_work(floating) == (0, every)
+    # A hundred quantised convolutions of four channels behind it, each of which changes nothing.
+    for node in floating.graph.node:
+        node.output[:] = ["c0" if name == "logits" else name for name in node.output]
+    eye = np.eye(4, dtype=np.float32)[:, :, None, None]
+    stored = ((eye, "eye"), (np.array(0.01, np.float32), "s"), (np.array(0, np.int8), "z"))
+    floating.graph.initializer.extend(numpy_helper.from_array(array, name) for array, name in stored)
+    for k in range(100):
+        out = "logits" if k == 99 else f"c{k + 1}"
+        floating.graph.node.extend([
+            helper.make_node("QuantizeLinear", [f"c{k}", "s", "z"], [f"q{k}"]),
+            helper.make_node("DequantizeLinear", [f"q{k}", "s", "z"], [f"d{k}"]),
+            helper.make_node("QuantizeLinear", ["eye", "s", "z"], [f"w{k}"]),
+            helper.make_node("DequantizeLinear", [f"w{k}", "s", "z"], [f"v{k}"]),
+            helper.make_node("Conv", [f"d{k}", f"v{k}"], [out]),
+        ])  # fmt: skip
+    onnx.checker.check_model(floating)
+    low, more = network_file.quantised_work(floating)
+    assert low == 100 * 16 * 64 * 64 == more - every
+    # What does not reach the output does not count at all.
+    floating.graph.output[0].name = "c0"
+    assert network_file.quantised_work(floating) == (0, every)
 
 
 def test_the_kits_student_is_known_in_any_disguise_and_ours_is_our_own(repo: Path, handed_in: Path) -> None:
-    network_file.check_own(network_file.load(FILE))
+    network_file.check_own(network_file.load(HANDED_IN))
     mutants, _ = load_mutants(find_course(repo), LAB)
     disguised = next(m for m in mutants if m.name == "kits-student-in-disguise")
     content = disguised.files[FILE](handed_in.parent)
     assert content is not None
     handed_in.write_bytes(content)
     with pytest.raises(CheckFailure) as caught:
-        network_file.check_own(network_file.load(FILE))
+        network_file.check_own(network_file.load(HANDED_IN))
     assert caught.value.hint == "train-your-own"
 
 
@@ -461,7 +511,7 @@ def test_a_hostile_file_gets_a_sentence(handed_in: Path, damage: str) -> None:
         data = model.SerializeToString()
     handed_in.write_bytes(data)
     with pytest.raises(CheckFailure) as caught:
-        network_file.load(FILE)
+        network_file.load(HANDED_IN)
     assert caught.value.hint == "not-a-network" and FILE in caught.value.message
 
 
@@ -476,7 +526,7 @@ def test_a_resize_cannot_ask_for_terabytes(handed_in: Path) -> None:
     model.graph.node.append(onnx.helper.make_node("Resize", ["small", "", "much"], ["logits"]))
     onnx.save(model, FILE)
     with pytest.raises(CheckFailure) as caught:
-        network_file.load(FILE)
+        network_file.load(HANDED_IN)
     assert caught.value.hint == "not-a-network"
 
 

@@ -55,6 +55,7 @@ def test_every_hint_and_every_mutant_is_of_use(repo: Path, suite: Suite) -> None
     assert {m.hint for m in mutants} <= set(suite.hints)
     assert {m.exercise for m in mutants} == set(suite.exercises)
     files = [f"src/robotbrain/grading/suites/{LAB}{part}.py" for part in ("", "_tools", "_drives", "_verdict")]
+    files.append("src/robotbrain/grading/suites/planner_bench.py")
     tests = "".join((repo / name).read_text(encoding="utf-8") for name in [*files, f"autograder/hidden/{LAB}.py"])
     assert [key for key in suite.hints if tests.count(f'"{key}"') < 2] == []
 
@@ -64,7 +65,7 @@ def test_every_hint_and_every_mutant_is_of_use(repo: Path, suite: Suite) -> None
 
 @pytest.mark.parametrize("stage", ["size", "size+int8+threads"])
 def test_ages_and_chains_agree_with_what_the_kit_follows_by_stamps(stage: str) -> None:
-    run = traces.brain_run(stage)
+    run = traces.brain_run(stage, seconds=4.0)
     assert run.trace is not None
     count = len(run.camera_age_ms)
     assert count > 40
@@ -139,11 +140,14 @@ def test_what_the_homework_tells_about_the_patient_is_true(repo: Path) -> None:
     assert len(ill.e2e_ms) == stored["inherited"]["commands_built_on_an_image"] == 0
     late = float(np.percentile(ill.perception_ms, 95))
     assert late == pytest.approx(stored["inherited"]["image_to_points_p95_ms"], rel=0.02)
-    measured = tools.service_ms(traces.brain_trace("size+int8"), tools.PERCEPTION, tools.IMAGE, "gpu", 1.0)
+    seconds = stored["int8_after_size"]["seconds"]
+    measured = tools.service_ms(
+        traces.brain_trace("size+int8", seconds=seconds), tools.PERCEPTION, tools.IMAGE, "gpu", 1.0
+    )
     assert measured == pytest.approx(stored["int8_after_size"]["perception_ms"], rel=0.02)
     # The same brain has another bottleneck on another module, and each cure brings up the next.
     nano, nx = "orin-nano-8gb:15W", "xavier-nx:15W"
-    assert tools.bottleneck(traces.brain_trace("inherited", nano)) == ("perception", "cpu")
+    assert tools.bottleneck(traces.brain_trace("inherited", nano, 4.0)) == ("perception", "cpu")
     assert tools.bottleneck(traces.brain_trace("size", nano)) == ("perception", "sharing")
     assert tools.bottleneck(traces.brain_trace("inherited", nx, 8.0)) == ("perception", "gpu")
     assert tools.bottleneck(traces.brain_trace("int8", nx)) == ("perception", "cpu")

@@ -56,4 +56,4 @@ def test_every_submission_ends_in_a_grade_and_a_feedback_page(graded: classes.Gr
 
 
 def test_hidden_tests_do_not_show_in_feedback(graded: classes.Graded) -> None:
-    classes.check_secrets(graded, LAB, "_random_cost", "compare_astar")
+    classes.check_secrets(graded, LAB, "weighted_maze", "compare_astar")

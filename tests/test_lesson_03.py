@@ -25,6 +25,8 @@ from robotbrain.optimisation.networks import parameter_count
 assert 0.8e6 < parameter_count(teacher) < 1.3e6 and 40e3 < parameter_count(student) < 65e3
 assert np.abs(runs["fused"]() - torch_run()).max() < 1e-3 * np.abs(torch_run()).max()
 assert not (folder / "fog.onnx").exists()
+xavier, *others = [a.latency_ms / b.latency_ms for a, b in zip(race("fp32").predictions, race("fp16").predictions)][1:]
+assert xavier > 5 and all(1.8 < gain < 2.6 for gain in others)  # "now it flies", "about twice as fast"
 boards3 = [("nano-4gb", "MAXN"), ("orin-nano-8gb", "15W"), ("agx-orin-64gb", "MAXN")]
 both = [[predict(networks[n], d, mode=m, precision="fp16") for n in ("student", "teacher")] for d, m in boards3]
 assert all(b.macs > 9 * a.macs and b.latency_ms < 2.05 * a.latency_ms for a, b in both)

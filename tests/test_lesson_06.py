@@ -22,6 +22,12 @@ assert max(report.sensitivity("plain"), key=lambda k: abs(report.sensitivity("pl
 assert max(map(abs, report.sensitivity("randomised").values())) < 0.5
 assert "4 of 4" in motions[0].label and "4 of 4" not in motions[1].label
 assert max(reach_over_ros([(0.5, 0.3, 0.4), (0.4, -0.3, 0.6)], serial=7)) < 0.02
+assert learned.success and not learned.collisions and learned.seconds > 24 and learned.path_length > 10
+import json
+from robotbrain.rl.tasks import navigation
+recipe = json.loads(navigation.SHIPPED_RECIPE.read_text())
+assert recipe["minutes"] < 12 and 0.9e6 < recipe["env_steps"] < 1e6
+assert {"reached": 448, "episodes": 512, "collisions": 34}.items() <= recipe["evaluation"][0].items()
 """
 
 

@@ -39,6 +39,7 @@ COMMANDS: dict[str, Command] = {
     "optimise": Command("robotbrain.optimisation.commands:optimise", "quantise, prune and distil a network; a sweep"),
     "grade": Command("robotbrain.grading.commands:grade", "grade one notebook and print the report"),
     "grade-class": Command("robotbrain.grading.commands:grade_class", "grade all submissions of a lab"),
+    "report": Command("robotbrain.grading.reports.commands:report", "pages and tables of a graded class, exports"),
     "generate": Command("robotbrain.grading.commands:generate", "make the students' version of a lab"),
     "sample-class": Command("robotbrain.grading.commands:sample_class", "make submissions to try grading on"),
     "mutation-test": Command("robotbrain.grading.commands:mutation_test", "test the tests of a lab"),

@@ -73,7 +73,7 @@ def copy_course(repo: Path, target: Path) -> Path:
 def serve(course: Path, scratch: Path) -> Iterator[LabServer]:
     """Run ``robotbrain lab`` on ``course`` as a user who never used Jupyter; on exit nothing of it is left running."""
     home = _home(scratch)
-    port = _free_port()
+    port = free_port()
     log = scratch / "jupyterlab.log"
     command = [
         sys.executable,
@@ -87,23 +87,30 @@ def serve(course: Path, scratch: Path) -> Iterator[LabServer]:
         str(course),
     ]
     with log.open("wb") as output:
-        process = psutil.Popen(command, env=_environment(home), cwd=scratch, stdout=output, stderr=subprocess.STDOUT)
+        process = psutil.Popen(
+            command, env=user_environment(home), cwd=scratch, stdout=output, stderr=subprocess.STDOUT
+        )
     url = f"http://127.0.0.1:{port}"
+    try:
+        wait_for_server(process, url, log)
+        yield LabServer(url, course, home, process)
+    finally:
+        end_tree(process)
+
+
+def wait_for_server(process: psutil.Popen, url: str, log: Path) -> None:
+    """Wait until a Jupyter server at ``url`` answers; fail with its log if it ends instead."""
 
     def up() -> bool:
         if process.poll() is not None:
-            raise AssertionError(f"robotbrain lab ended with {process.returncode}:\n{log.read_text(errors='replace')}")
+            raise AssertionError(f"the server ended with {process.returncode}:\n{log.read_text(errors='replace')}")
         try:
             with urllib.request.urlopen(f"{url}/api/status?token={TOKEN}", timeout=5) as reply:
                 return bool(reply.status == 200)
         except (urllib.error.URLError, OSError):
             return False
 
-    try:
-        wait_until(up, 90, lambda: f"an answer from {url}\n{log.read_text(errors='replace')}")
-        yield LabServer(url, course, home, process)
-    finally:
-        end_tree(process)
+    wait_until(up, 90, lambda: f"an answer from {url}\n{log.read_text(errors='replace')}")
 
 
 def end_tree(process: psutil.Popen) -> None:
@@ -130,7 +137,8 @@ def _home(scratch: Path) -> Path:
     return home
 
 
-def _environment(home: Path) -> dict[str, str]:
+def user_environment(home: Path) -> dict[str, str]:
+    """Variables for the user whose home is ``home``: nothing of this machine's Jupyter, and a fixed token."""
     kept = {
         k: v for k, v in os.environ.items() if not k.startswith(("JUPYTER", "ROBOTBRAIN", "NBGRADER", "MPLBACKEND"))
     }
@@ -146,7 +154,8 @@ def _environment(home: Path) -> dict[str, str]:
     }
 
 
-def _free_port() -> int:
+def free_port() -> int:
+    """A TCP port that nobody listens on."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])

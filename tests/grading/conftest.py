@@ -1,10 +1,12 @@
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from robotbrain.grading.bench import Bench
 from robotbrain.grading.suite import AUTOGRADER_VARIABLE, SUITES_VARIABLE
 from tests.grading import toylab
 
@@ -31,3 +33,21 @@ def _toy_hidden_tests(course_root: Path, monkeypatch: pytest.MonkeyPatch) -> Non
 @pytest.fixture
 def notebook_globals() -> dict[str, object]:
     return {"__name__": "__main__"}
+
+
+@pytest.fixture(scope="session")
+def light_bench(course_root: Path) -> Callable[..., Bench]:
+    """Makes benches of the toy course, whose servers start quickly: without torch, MuJoCo and the like."""
+
+    def make(**options: Any) -> Bench:
+        usual = {"preload_labs": [toylab.LAB], "preload": ["numpy", "matplotlib.pyplot"]}
+        return Bench(course_root / "autograder", **{**usual, **options})
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def toy_bench(light_bench: Callable[..., Bench]) -> Iterator[Bench]:
+    """One bench for all tests of this process; set its ``limits`` before use."""
+    with light_bench() as bench:
+        yield bench

@@ -1,24 +1,30 @@
-"""Real kernels, small notebooks."""
+"""What a submission's code does to its own grade: small notebooks on the real bench and the real tester."""
 
 from __future__ import annotations
 
-import os
-import sys
-import time
+import dataclasses
 from pathlib import Path
 from typing import Any
 
-import psutil
 import pytest
 from nbformat.v4 import new_code_cell, new_notebook, output_from_msg
 
-from robotbrain.grading import intake, jobs
-from robotbrain.grading.execute import Limits, execute_notebook, make_gradable
+from robotbrain.grading import intake
+from robotbrain.grading.bench import Bench
+from robotbrain.grading.execute import Execution, Limits, make_gradable
 from robotbrain.grading.marks import Mark, marks_of
+from robotbrain.grading.outputs import CellOutputs
+from robotbrain.grading.report import SCORE_MIME
+from robotbrain.grading.scoring import Question, question_of
 from tests.grading import toylab
 
-FAST = Limits(cell_s=1.5, graded_s=6.0, grace_s=1.0, wall_s=60.0, output_bytes=100_000)
-posix = pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
+FAST = Limits(cell_s=1.5, graded_s=8.0, grace_s=0.5, wall_s=60.0, output_bytes=100_000)
+
+
+@pytest.fixture
+def bench(toy_bench: Bench) -> Bench:
+    toy_bench.limits = FAST
+    return toy_bench
 
 
 @pytest.fixture
@@ -30,8 +36,10 @@ def heal(course_root: Path, tmp_path: Path) -> Any:
     return make
 
 
-def graded(healed: intake.Healed, tmp_path: Path, limits: Limits = FAST) -> tuple[dict[str, Mark], list[str]]:
-    run = execute_notebook(healed.notebook, cwd=tmp_path, limits=limits)
+def graded(bench: Bench, healed: intake.Healed, **limits: Any) -> tuple[dict[str, Mark], list[str]]:
+    bench.limits = dataclasses.replace(FAST, **limits)
+    run = bench.execute(healed.notebook, lab="toy", student="amara", files={})
+    assert run.sound and run.notebook is healed.notebook
     return {m.exercise: m for m in marks_of(run.notebook)}, run.incidents
 
 
@@ -39,158 +47,226 @@ def points(marks: dict[str, Mark]) -> list[float | None]:
     return [marks[name].earned for name in ("scale", "total", "mean")]
 
 
-def test_the_solution_gets_everything_and_training_is_skipped(heal: Any, tmp_path: Path) -> None:
+def cell_of(healed: intake.Healed, name: str) -> Any:
+    return next(c for c in healed.notebook.cells if intake.grade_id(c) == name)
+
+
+def test_the_solution_gets_everything_and_training_is_skipped(bench: Bench, heal: Any) -> None:
     healed = heal()
-    marks, incidents = graded(healed, tmp_path)
+    marks, incidents = graded(bench, healed)
     assert points(marks) == [4.0, 6.0, 5.0]
     assert incidents == []
     assert "not run while grading" in healed.notebook.cells[-1].outputs[0].text
 
 
-def test_a_syntax_error_costs_its_own_exercise_only(heal: Any, tmp_path: Path) -> None:
-    marks, _ = graded(heal(scale="def scale(x:\n    return 2 * x"), tmp_path)
+def test_a_syntax_error_costs_its_own_exercise_only(bench: Bench, heal: Any) -> None:
+    marks, _ = graded(bench, heal(scale="def scale(x:\n    return 2 * x"))
     assert points(marks) == [0.0, 6.0, 5.0]
     assert "not defined" in marks["scale"].tests[0]["message"]
 
 
-def test_a_cell_that_ends_the_kernel_is_left_out(heal: Any, tmp_path: Path) -> None:
+def test_a_cell_that_ends_the_process_is_left_out(bench: Bench, heal: Any) -> None:
     healed = heal(total="import os\nos._exit(1)")
-    marks, incidents = graded(healed, tmp_path)
+    marks, incidents = graded(bench, healed)
     assert points(marks) == [4.0, 0.0, 5.0]
-    assert incidents == ["total: this cell ended the kernel"]
-    cell = next(c for c in healed.notebook.cells if intake.grade_id(c) == "total")
-    assert cell.outputs[0].evalue == "this cell ended the kernel"
+    assert incidents == ["total: this cell ended the Python process"]
+    assert cell_of(healed, "total").outputs[0].evalue == "this cell ended the Python process"
 
 
-def test_a_test_that_ends_the_kernel_costs_its_own_exercise_only(heal: Any, tmp_path: Path) -> None:
-    marks, incidents = graded(heal(scale="def scale(x):\n    import os\n    os._exit(1)"), tmp_path)
+def test_a_test_that_ends_the_process_costs_its_own_exercise_only(bench: Bench, heal: Any) -> None:
+    marks, incidents = graded(bench, heal(scale="def scale(x):\n    import os\n    os._exit(1)"))
     assert points(marks) == [0.0, 6.0, 5.0]
     assert {t["verdict"] for t in marks["scale"].tests} == {"crashed"}
     assert marks["total"].substituted == ["scale"]
-    assert any("ended the kernel during the test" in text for text in incidents)
+    assert any("ended the Python process during the test" in text for text in incidents)
 
 
-def test_only_the_crashing_test_is_lost(heal: Any, tmp_path: Path) -> None:
+def test_only_the_crashing_test_is_lost(bench: Bench, heal: Any) -> None:
     code = "import os\ndef mean(values):\n    return sum(values) / len(values) if values else os._exit(1)"
-    marks, _ = graded(heal(mean=code), tmp_path)
+    marks, _ = graded(bench, heal(mean=code))
     assert points(marks) == [4.0, 6.0, 3.0]
     assert [t["verdict"] for t in marks["mean"].tests] == ["passed", "crashed"]
 
 
-def test_an_endless_cell_is_interrupted(heal: Any, tmp_path: Path) -> None:
-    marks, incidents = graded(heal(total="while True: pass"), tmp_path)
+def test_a_test_after_a_crash_meets_a_fresh_process(bench: Bench, heal: Any) -> None:
+    code = "import os\ndef mean(values):\n    return sum(values) / len(values) if not values else os._exit(1)"
+    marks, _ = graded(bench, heal(mean=code.replace("sum(values) / len(values) if not", "0.0 if not")))
+    assert [t["verdict"] for t in marks["mean"].tests] == ["crashed", "passed"]
+
+
+def test_a_test_that_takes_all_memory_is_told_so(bench: Bench, heal: Any) -> None:
+    marks, _ = graded(bench, heal(scale="def scale(x):\n    return bytearray(10**10)"))
+    assert points(marks) == [0.0, 6.0, 5.0]
+    assert {t["verdict"] for t in marks["scale"].tests} == {"memory"}
+
+
+def test_an_endless_cell_is_interrupted(bench: Bench, heal: Any) -> None:
+    marks, incidents = graded(bench, heal(total="while True: pass"))
     assert points(marks) == [4.0, 0.0, 5.0]
     assert "total: this cell did not finish" in incidents[0]
 
 
-@posix
-def test_a_cell_deaf_to_interrupts_is_killed(heal: Any, tmp_path: Path) -> None:
+def test_an_endless_test_is_interrupted(bench: Bench, heal: Any) -> None:
+    marks, _ = graded(bench, heal(scale="def scale(x):\n    while True: pass"))
+    assert points(marks) == [0.0, 6.0, 5.0]
+    assert {t["verdict"] for t in marks["scale"].tests} == {"timeout"}
+
+
+def test_a_cell_deaf_to_interrupts_is_killed(bench: Bench, heal: Any) -> None:
     deaf = "import signal\nsignal.signal(signal.SIGINT, signal.SIG_IGN)\nwhile True: pass"
-    marks, incidents = graded(heal(total=deaf), tmp_path)
+    marks, incidents = graded(bench, heal(total=deaf))
     assert points(marks) == [4.0, 0.0, 5.0]
     assert "did not react to an interrupt" in incidents[0]
 
 
-@posix
-def test_a_test_deaf_to_alarms_is_killed(heal: Any, tmp_path: Path) -> None:
+def test_a_test_deaf_to_interrupts_is_killed(bench: Bench, heal: Any) -> None:
     deaf = (
         "import signal\ndef scale(x):\n    for number in (signal.SIGALRM, signal.SIGINT):\n"
         "        signal.signal(number, signal.SIG_IGN)\n    while True: pass"
     )
-    marks, incidents = graded(heal(scale=deaf), tmp_path, Limits(1.5, 2.5, 1.0, 60.0))
+    marks, incidents = graded(bench, heal(scale=deaf))
     assert points(marks) == [0.0, 6.0, 5.0]
+    assert {t["verdict"] for t in marks["scale"].tests} == {"timeout"}
     assert "hung" in incidents[0]
 
 
-def test_many_deadly_cells_end_the_run_with_reasons(heal: Any, tmp_path: Path) -> None:
+def test_many_deadly_cells_end_the_run_with_reasons(bench: Bench, heal: Any) -> None:
     deadly = "import os\nos._exit(1)"
-    limits = Limits(1.5, 6.0, 1.0, 60.0, poisoned=1)
-    marks, _ = graded(heal(scale=deadly, total=deadly), tmp_path, limits)
+    marks, _ = graded(bench, heal(scale=deadly, total=deadly), poisoned=1)
     assert points(marks) == [0.0, 0.0, 0.0]
     assert "not run" in marks["mean"].error
 
 
-def test_the_wall_limit_leaves_a_reason_on_every_graded_cell(heal: Any, tmp_path: Path) -> None:
-    limits = Limits(cell_s=30.0, graded_s=30.0, grace_s=0.5, wall_s=4.0)
-    marks, incidents = graded(heal(total="import time\ntime.sleep(60)"), tmp_path, limits)
-    assert points(marks) == [4.0, 0.0, 0.0]
-    assert "4 s" in marks["mean"].error
-    assert any("longer than 4 s" in text for text in incidents)
+def test_the_wall_limit_leaves_a_reason_on_every_graded_cell(bench: Bench, heal: Any) -> None:
+    marks, incidents = graded(bench, heal(total="import time\ntime.sleep(60)"), cell_s=30.0, wall_s=3.0)
+    assert points(marks) == [4.0, 0.0, 0.0]  # what was done before counts
+    assert "3 s" in marks["mean"].error
+    assert any("longer than 3 s" in text for text in incidents)
 
 
-def test_a_flood_of_output_is_cut_and_the_score_kept(heal: Any, tmp_path: Path) -> None:
+def test_a_flood_of_output_is_cut_and_the_score_kept(bench: Bench, heal: Any) -> None:
     loud = "import os\ndef scale(x):\n    for _ in range(40):\n        os.write(1, b'x' * 9999)\n    return 2 * x"
     healed = heal(scale=loud, total=f"{toylab.SOLUTIONS['total']}\nfor _ in range(2000):\n    print('x' * 1000)")
-    marks, _ = graded(healed, tmp_path)
+    marks, _ = graded(bench, healed)
     assert points(marks) == [4.0, 6.0, 5.0]
-    for name in ("total", "score-scale"):
-        cell = next(c for c in healed.notebook.cells if intake.grade_id(c) == name)
-        assert len(str(cell.outputs)) < 3 * FAST.output_bytes
-        assert "was dropped" in str(cell.outputs)
+    assert len(str(cell_of(healed, "total").outputs)) < 2 * FAST.output_bytes
+    assert "was dropped" in str(cell_of(healed, "total").outputs)
 
 
-def test_stderr_is_kept_under_a_label_and_costs_nothing(heal: Any, tmp_path: Path) -> None:
-    loud = "import os\ndef scale(x):\n    os.write(2, b'note')\n    return 2 * x"
+def test_what_a_test_prints_and_warns_costs_nothing(bench: Bench, heal: Any) -> None:
+    loud = (
+        "import warnings, sys\ndef scale(x):\n    warnings.warn('w')\n    print('p', file=sys.stderr)\n    return 2 * x"
+    )
     healed = heal(scale=loud)
-    marks, _ = graded(healed, tmp_path)
+    marks, _ = graded(bench, healed)
     assert points(marks) == [4.0, 6.0, 5.0]
-    assert not any(
-        o.get("name") == "stderr" for c in healed.notebook.cells for o in c.get("outputs", []) if "score" in c.source
+    assert not any(o.get("name") == "stderr" for o in cell_of(healed, "score-scale").outputs)
+
+
+def test_each_graded_cell_meets_the_notebook_as_it_was_there(bench: Bench, heal: Any) -> None:
+    marks, _ = graded(bench, heal(mean=f"{toylab.SOLUTIONS['mean']}\ndef scale(x):\n    return None"))
+    assert points(marks) == [4.0, 6.0, 5.0]
+
+
+def test_what_a_hidden_test_passes_in_does_not_reach_the_notebook(bench: Bench, heal: Any) -> None:
+    spy = (
+        "import atexit, threading, time\n"
+        "def scale(x):\n    open('seen', 'a').write(f'{x}\\n')\n    print('SEEN', x)\n    return 2 * x"
     )
+    tell = f"{toylab.SOLUTIONS['mean']}\nimport os\nprint(open('seen').read() if os.path.exists('seen') else 'nothing')"
+    healed = heal(scale=spy, mean=tell)
+    marks, _ = graded(bench, healed)
+    assert points(marks) == [4.0, 6.0, 5.0]
+    assert cell_of(healed, "mean").outputs[0].text == "nothing\n"
+    assert "41.5" not in str(healed.notebook)
 
 
-def test_an_operators_secrets_stay_out_of_the_kernel(
-    heal: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("DATABASE_TOKEN", "hunter2")
-    healed = heal(scale="import os\nprint(sorted(os.environ), os.environ.get('DATABASE_TOKEN'))")
-    execute_notebook(healed.notebook, cwd=tmp_path, limits=FAST)
-    cell = next(c for c in healed.notebook.cells if intake.grade_id(c) == "scale")
-    assert "PATH" in cell.outputs[0].text and "hunter2" not in cell.outputs[0].text
+def test_what_a_hidden_test_passes_in_does_not_reach_a_later_report(bench: Bench, heal: Any) -> None:
+    keep = "def scale(x):\n    open('seen', 'a').write(f'{x}\\n')\n    return 2 * x"
+    tell = "def mean(values):\n    return open('seen').read()"
+    healed = heal(scale=keep, mean=tell)
+    marks, _ = graded(bench, healed)
+    assert points(marks) == [4.0, 6.0, 0.0]
+    assert "3.0" in str(marks["mean"].tests) and "41.5" not in str(healed.notebook)
 
 
-@posix
-def test_a_submission_that_kills_its_worker_gets_a_zero_and_leaves_nothing_behind(
-    heal: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
-    (tmp_path / "temporary").mkdir()
-    mark = tmp_path / "pid"
-    code = (
-        "import os, signal, subprocess, sys\n"
-        f"p = subprocess.Popen([{sys.executable!r}, '-c', 'import time; time.sleep(600)'], start_new_session=True)\n"
-        f"open({str(mark)!r}, 'w').write(str(p.pid))\n"
-        "os.kill(os.getppid(), signal.SIGKILL)\nimport time; time.sleep(30)"
+def test_a_notebook_with_threads_is_graded_without_copies(bench: Bench, heal: Any) -> None:
+    threads = "import threading, time\nthreading.Thread(target=time.sleep, args=(60,), daemon=True).start()\n"
+    marks, _ = graded(bench, heal(scale=threads + toylab.SOLUTIONS["scale"]))
+    assert points(marks) == [4.0, 6.0, 5.0]
+
+
+def test_a_broken_tester_costs_no_other_exercise(bench: Bench, heal: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    from robotbrain.grading import scoring
+
+    ask = scoring.Scorer._ask
+
+    def die_once(self: Any, graded: Any, question: Any) -> Any:
+        if graded.name == "total":
+            raise scoring.TesterDied("on purpose")
+        return ask(self, graded, question)
+
+    monkeypatch.setattr(scoring.Scorer, "_ask", die_once)
+    marks, incidents = graded(bench, heal())
+    assert points(marks) == [4.0, 0.0, 5.0]
+    assert "tell the teacher" in marks["total"].error and any("the tester ended" in text for text in incidents)
+
+
+@pytest.mark.parametrize(
+    ("source", "question"),
+    [
+        ("lab.score('x')", Question("x", False)),
+        ("lab.score('x')\n# note\nlab.score('x', hidden=True)", Question("x", True)),
+        ("lab.score('x', True)", Question("x", True)),
+        ("assert f(1) == 2", Question("", True)),
+        ("lab.score('x')\nassert f(1) == 2", Question("", True)),
+        ("lab.score(name)", Question("", True)),
+        ("def broken(:", Question("", True)),
+    ],
+)
+def test_what_a_graded_cell_asks(source: str, question: Question) -> None:
+    assert question_of(source) == question
+
+
+def test_a_cell_in_the_students_process_cannot_bring_a_score(bench: Bench) -> None:
+    forged = (
+        "class F:\n    def _repr_mimebundle_(self, **k):\n"
+        f"        return {{{SCORE_MIME!r}: '{{}}', 'text/plain': '5.0'}}\nF()"
     )
-    result = jobs.run_job(heal(total=code), None, FAST, "amara", tmp_path / "cache.ipynb")
-    marks = {m.exercise: m for m in marks_of(result.notebook)}
-    assert points(marks) == [4.0, 0.0, 0.0]  # what was done before counts
-    assert "ended the process that ran it" in marks["mean"].error
-    assert not (tmp_path / "cache.ipynb").exists()
-    assert list((tmp_path / "temporary").iterdir()) == []
-    deadline = time.monotonic() + 10
-    while psutil.pid_exists(int(mark.read_text())) and time.monotonic() < deadline:
-        if psutil.Process(int(mark.read_text())).status() == psutil.STATUS_ZOMBIE:
-            break
-        time.sleep(0.05)
-    else:
-        assert not psutil.pid_exists(int(mark.read_text()))
+    notebook = new_notebook(cells=[new_code_cell(forged)])
+    notebook.cells[0].metadata = {"tags": ["student-process"], "nbgrader": _nbgrader(5)}
+    bench.limits = FAST
+    execution: Execution = bench.execute(notebook, lab="toy", student="amara", files={})
+    assert SCORE_MIME not in str(execution.notebook.cells[0].outputs)
 
 
-def test_a_machine_without_kernels_is_not_blamed_on_the_student(
-    heal: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(jobs, "_supervise", lambda *a: jobs._NOT_STARTED)
-    result = jobs.run_job(heal(), None, FAST, "amara", tmp_path / "cache.ipynb")
-    marks = {m.exercise: m for m in marks_of(result.notebook)}
-    assert points(marks) == [0.0, 0.0, 0.0]
-    assert "no fault of the submission" in marks["scale"].error
-    assert not (tmp_path / "cache.ipynb").exists()
+@pytest.mark.parametrize(
+    "message",
+    [
+        {},
+        {"op": "stream", "name": "stdout", "text": b"x"},
+        {"op": "stream", "name": "other", "text": "x"},
+        {"op": "output", "output": []},
+        {"op": "output", "output": {"output_type": "execute_result", "data": []}},
+        {"op": "output", "output": {"output_type": "made up", "data": {}}},
+        {"op": "output", "output": {"output_type": "error", "ename": 1, "evalue": "", "traceback": []}},
+        {"op": "output", "output": {"output_type": "display_data", "data": {}}, "id": [], "update": True},
+        {"op": "clear", "wait": []},
+    ],
+)
+def test_messages_without_proper_form_are_ignored(message: dict[str, Any]) -> None:
+    outputs = CellOutputs(1000)
+    outputs.take(message)
+    assert outputs.result() == []
+
+
+def _nbgrader(points: float) -> dict[str, Any]:
+    return {"grade": True, "solution": False, "points": points, "grade_id": "x"}
 
 
 def _graded_cell(source: str, *outputs: Any) -> Any:
     cell = new_code_cell(source, outputs=list(outputs))
-    cell.metadata["nbgrader"] = {"grade": True, "solution": False, "points": 5, "grade_id": "x"}
+    cell.metadata["nbgrader"] = _nbgrader(5)
     return new_notebook(cells=[cell]).cells[0]
 
 

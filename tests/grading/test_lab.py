@@ -289,11 +289,18 @@ def test_an_interrupted_cell_keeps_what_was_earned(monkeypatch: pytest.MonkeyPat
     suite.test("answer", points=1, name="a")(lambda student: None)
     suite.test("answer", points=1, name="b")(interrupted)
     suite.test("answer", points=1, name="c")(lambda student: None)
-    report = lab_of("", suite, "demo").check("answer")
+    report = lab_of("", suite, "demo").score("answer").report
     assert [r.verdict for r in report.results] == [Verdict.PASSED, Verdict.TIMEOUT, Verdict.TIMEOUT]
     monkeypatch.delenv("NBGRADER_EXECUTION")
     with pytest.raises(KeyboardInterrupt):
-        lab_of("", suite, "demo").check("answer")
+        lab_of("", suite, "demo").score("answer")
+
+
+def test_while_grading_a_check_runs_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NBGRADER_EXECUTION", "autograde")
+    lab = lab_of("calls = []\ndef scale(x):\n    calls.append(x)\n    return 2 * x")
+    assert "score below" in repr(lab.check("scale"))
+    assert lab._namespace["calls"] == []
 
 
 def test_an_unknown_exercise_lists_the_known_ones() -> None:

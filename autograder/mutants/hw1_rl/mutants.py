@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from robotbrain.grading.harmful_onnx import endless_loop, weights_in_another_file
 from robotbrain.grading.sample import Mutant
 
 PLAIN, ROBUST = "reach_policy.onnx", "reach_policy_robust.onnx"
@@ -50,40 +51,6 @@ def _weights(change: Callable[[Any, Any], Any]) -> Callable[[Any], None]:
             tensor.CopyFrom(numpy_helper.from_array(changed, tensor.name))
 
     return all_weights
-
-
-def _weights_in_another_file(model: Any) -> None:
-    """Point the first weights to a file outside of the submission."""
-    tensor = model.graph.initializer[0]
-    tensor.ClearField("raw_data")
-    tensor.data_location = 1
-    for key, value in (("location", "../../../../../../etc/hostname"), ("offset", "0")):
-        entry = tensor.external_data.add()
-        entry.key, entry.value = key, value
-
-
-def _endless_loop(model: Any) -> None:
-    """Put a loop of 2^62 rounds before the network."""
-    import numpy as np
-    from onnx import TensorProto, helper, numpy_helper
-
-    body = helper.make_graph(
-        [helper.make_node("Identity", ["again"], ["goes_on"]), helper.make_node("Tanh", ["x"], ["y"])],
-        "body",
-        [
-            helper.make_tensor_value_info("k", TensorProto.INT64, []),
-            helper.make_tensor_value_info("again", TensorProto.BOOL, []),
-            helper.make_tensor_value_info("x", TensorProto.FLOAT, None),
-        ],
-        [
-            helper.make_tensor_value_info("goes_on", TensorProto.BOOL, []),
-            helper.make_tensor_value_info("y", TensorProto.FLOAT, None),
-        ],
-    )
-    model.graph.initializer.append(numpy_helper.from_array(np.array(2**62), "rounds"))
-    for node in model.graph.node:
-        node.input[:] = ["looped" if name == "obs" else name for name in node.input]
-    model.graph.node.insert(0, helper.make_node("Loop", ["rounds", "", "obs"], ["looped"], body=body))
 
 
 def _other_task(folder: Path) -> bytes:
@@ -776,7 +743,7 @@ def actor_loss(actor, critic, batch):
         describe="refers to a file outside of the submission for its weights (hostile)",
         loses=12.0,
         replace={},
-        files={PLAIN: _edited(PLAIN, _weights_in_another_file)},
+        files={PLAIN: _edited(PLAIN, weights_in_another_file)},
     ),
     Mutant(
         name="endless-loop-inside",
@@ -785,7 +752,7 @@ def actor_loss(actor, critic, batch):
         describe="holds a loop of 2^62 rounds (hostile)",
         loses=12.0,
         replace={},
-        files={PLAIN: _edited(PLAIN, _endless_loop)},
+        files={PLAIN: _edited(PLAIN, lambda model: endless_loop(model, "obs"))},
     ),
     Mutant(
         name="another-task",

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from robotbrain.grading.harmful_onnx import endless_loop, weights_in_another_file
 from robotbrain.grading.sample import Mutant
 
 FILE = "student_int8.onnx"
@@ -186,40 +187,6 @@ def _classes_turned(model: Any) -> None:
         if tensor.name in names:
             array = numpy_helper.to_array(tensor)
             tensor.CopyFrom(numpy_helper.from_array(np.ascontiguousarray(array[[1, 2, 3, 0]]), tensor.name))
-
-
-def _weights_in_another_file(model: Any) -> None:
-    """Point the first weights to a file outside of the submission."""
-    tensor = model.graph.initializer[0]
-    tensor.ClearField("raw_data")
-    tensor.data_location = 1
-    for key, value in (("location", "../../../../../../etc/hostname"), ("offset", "0")):
-        entry = tensor.external_data.add()
-        entry.key, entry.value = key, value
-
-
-def _endless_loop(model: Any) -> None:
-    """Put a loop of 2^62 rounds before the network."""
-    import numpy as np
-    from onnx import TensorProto, helper, numpy_helper
-
-    body = helper.make_graph(
-        [helper.make_node("Identity", ["again"], ["goes_on"]), helper.make_node("Tanh", ["x"], ["y"])],
-        "body",
-        [
-            helper.make_tensor_value_info("k", TensorProto.INT64, []),
-            helper.make_tensor_value_info("again", TensorProto.BOOL, []),
-            helper.make_tensor_value_info("x", TensorProto.FLOAT, None),
-        ],
-        [
-            helper.make_tensor_value_info("goes_on", TensorProto.BOOL, []),
-            helper.make_tensor_value_info("y", TensorProto.FLOAT, None),
-        ],
-    )
-    model.graph.initializer.append(numpy_helper.from_array(np.array(2**62), "rounds"))
-    for node in model.graph.node:
-        node.input[:] = ["looped" if name == "image" else name for name in node.input]
-    model.graph.node.insert(0, helper.make_node("Loop", ["rounds", "", "image"], ["looped"], body=body))
 
 
 def _shipped(name: str) -> dict[str, Callable[[Path], bytes]]:
@@ -572,8 +539,8 @@ def two_four_mask(weight):
     _file("file-cut-off", "not-a-network", "hands in half of a file",
           {FILE: lambda folder: (folder / FILE).read_bytes()[:40_000]}, 19.0),
     _file("weights-elsewhere", "not-a-network", "refers to a file on the grader's disk",
-          _edited(_weights_in_another_file), 19.0),
-    _file("loops-for-ever", "not-a-network", "holds a loop without end", _edited(_endless_loop), 19.0),
+          _edited(weights_in_another_file), 19.0),
+    _file("loops-for-ever", "not-a-network", "holds a loop without end", _edited(lambda model: endless_loop(model, "image")), 19.0),
     _file("channels-last", "image-in-logits-out", "wants images with the channels last", _edited(_channels_last), 19.0),
     _file("not-a-number", "numbers-are-finite", "answers NaN", _edited(_first_bias_nan), 19.0),
     _file("floating-point-network", "int8-by-qdq", "hands in the network from before quantisation",

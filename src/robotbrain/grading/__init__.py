@@ -6,7 +6,7 @@ What a notebook uses: :class:`Lab`. Both import nothing heavy; nbgrader and Jupy
 
 from __future__ import annotations
 
-from robotbrain.grading.expect import CheckFailure, expect, expect_close, fail
+from robotbrain.grading.expect import CheckFailure, expect, expect_close, fail, type_name
 from robotbrain.grading.lab import Lab
 from robotbrain.grading.report import Report, Score, ScoreError
 from robotbrain.grading.results import TestResult, Verdict
@@ -30,4 +30,5 @@ __all__ = [
     "fail",
     "load_hidden_suite",
     "load_suite",
+    "type_name",
 ]

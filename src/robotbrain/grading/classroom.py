@@ -3,53 +3,58 @@
 from __future__ import annotations
 
 import contextlib
-import json
+import itertools
 import os
-import shutil
 import sys
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import nbformat
-
 from robotbrain.errors import InputError
-from robotbrain.files import write_text
-from robotbrain.grading import intake, jobs
-from robotbrain.grading.course import Course, generate, run_nbgrader
+from robotbrain.grading import backups, intake, jobs, roster, scheduler
+from robotbrain.grading.changes import Change
+from robotbrain.grading.classresult import ClassResult, Rows, feedback_page, write_results
+from robotbrain.grading.course import CONFIG_NAME, Course, generate
+from robotbrain.grading.entry import Entry, Person
 from robotbrain.grading.execute import Limits
-from robotbrain.grading.marks import Marks, csv_text, marks_of
+from robotbrain.grading.gradebook import wait_until_free
+from robotbrain.grading.lock import only_run
+from robotbrain.grading.marks import Marks, marks_of
+from robotbrain.grading.reports.feedback import write_feedback
 from robotbrain.grading.suite import AUTOGRADER_VARIABLE
+from robotbrain.grading.writer import Writer, student_ids
+
+__all__ = ["ClassResult", "Options", "feedback_page", "grade_class", "grade_notebook", "open_bench", "progress_bar"]
+
+Progress = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True)
-class ClassResult:
-    """A graded class: the rows, and where everything was written."""
+class Options:
+    """How a class is graded.
 
-    lab: str
-    rows: list[Marks]
-    results: Path
-    table: Path
-    feedback: Path
+    Attributes:
+        workers: how many submissions run at the same time; at least as many as a cluster has room for.
+        fresh: run every submission anew, whatever is cached.
+        require_sandbox: refuse to run without a sandbox.
+        cluster: address of a Dask scheduler whose workers run the submissions.
+        dry_run: run everything and say what would change, but write neither marks nor reports.
+        feedback: write the students' pages.
+    """
 
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-ready form, as in ``results.json``."""
-        return {"version": 1, "lab": self.lab, "students": [r.to_dict() for r in self.rows]}
-
-
-@dataclass(frozen=True)
-class _Task:
-    student: str
-    source: Path
-    healed: intake.Healed
-    folder: Path
-    cache: Path
+    workers: int = 1
+    limits: Limits = field(default_factory=Limits)
+    fresh: bool = False
+    require_sandbox: bool = False
+    cluster: str = ""
+    dry_run: bool = False
+    feedback: bool = True
 
 
 @contextlib.contextmanager
-def progress_bar() -> Iterator[Callable[[int, int, str], None]]:
+def progress_bar() -> Iterator[Progress]:
     """Show a bar on a terminal; gives the ``progress`` function of :func:`grade_class`."""
     from tqdm import tqdm
 
@@ -69,171 +74,186 @@ def grade_class(
     *,
     submitted: Path | None = None,
     out: Path | None = None,
+    db_url: str | None = None,
     workers: int = 1,
     limits: Limits | None = None,
     fresh: bool = False,
-    progress: Callable[[int, int, str], None] | None = None,
+    options: Options | None = None,
+    progress: Progress | None = None,
+    confirm: Callable[[list[Change]], bool] | None = None,
+    say: Callable[[str], None] | None = None,
 ) -> ClassResult:
     """Grade all submissions of ``lab``.
 
-    Each submission runs in a process of its own; then nbgrader's autograde enters the outcome in the gradebook and
-    nbgrader's generate_feedback writes the pages. Submissions already executed with the same tests are not run again.
+    Each submission runs in a process of its own, and its outcome is kept the moment it ends: a run that is stopped or
+    killed goes on where it was when started again. Once all have run, the marks are entered in the gradebook, one
+    transaction per student. Submissions already executed with the same tests are not run again.
 
     Args:
         submitted: folder with ``<student>/<lab>/`` in it; default: the course's own.
         out: folder for a grading run of its own (gradebook, feedback, results); default: the course's gradebook.
-        workers: how many submissions run at the same time.
-        fresh: run every submission anew, whatever is cached.
+        db_url: SQLAlchemy address of the gradebook; default: the one in ``nbgrader_config.py``, or in ``out``.
+        workers, limits, fresh: the fields of ``options`` used most; ignored if that is given.
         progress: called with (done, total, student) after each submission.
+        confirm: asked before marks that are there already are written over; default: they may be.
+        say: told what takes long or needs attention; default: print on stderr.
     """
-    limits = limits or Limits()
+    options = options or Options(workers=workers, limits=limits or Limits(), fresh=fresh)
+    say = say or (lambda text: print(text, file=sys.stderr))
     sources = course.sources(lab)
-    handed_in = submitted or course.root / course.submitted
-    in_place = out is None and handed_in.resolve() == (course.root / course.submitted).resolve()
-    students = _students(handed_in, lab, in_place=in_place)
-    target = course if out is None else course.isolated(out, lab)
-    log = target.results / "nbgrader.log"
-    generate(target, lab, log=log)
-    own = target.root / target.submitted
-    _stage(handed_in, own, lab, students, sources, in_place=in_place)
-    tests = [course.autograder / "hidden", course.autograder / "profiles", sources[0].parent]
-    environment = jobs.environment_fingerprint(tests)
-    tasks = []
-    for student in students:
-        for source in sources:
-            folder = own / student / lab
-            healed = intake.heal(folder / source.name, intake.master_of(source))
-            key = jobs.fingerprint(healed, folder, limits, environment + student)
-            cache = target.results / ".executed" / "cache" / f"{key}.ipynb"
-            if fresh:
-                cache.unlink(missing_ok=True)
-            tasks.append(_Task(student, source, healed, folder, cache))
-    done = _run_all(tasks, limits, workers, progress)
-    rows = _enter(target, lab, tasks, done, log)
-    return _write(target, lab, rows)
+    folder = submitted or course.root / course.submitted
+    in_place = out is None and folder.resolve() == (course.root / course.submitted).resolve()
+    students = roster.handed_in(folder, lab, in_place=in_place)
+    os.environ[AUTOGRADER_VARIABLE] = str(course.autograder)
+    with only_run((course.results if out is None else out) / ".executed"):
+        target = (course if out is None else course.isolated(out, lab)).with_gradebook(db_url)
+        run = _Run(target, lab, folder, sources, options, say)
+        return run.grade(students, progress, confirm)
 
 
-def _students(handed_in: Path, lab: str, *, in_place: bool) -> list[str]:
-    """Who handed in, in order. In the course's own folder, having only other labs means not having handed in."""
-    if not handed_in.is_dir():
-        raise InputError(
-            "submissions",
-            given=str(handed_in),
-            expected=f"a folder with <student>/{lab}/ in it",
-            fix="Name it with --submitted, or collect the submissions there.",
-        )
-    folders = [p for p in sorted(handed_in.iterdir()) if p.is_dir() and not p.name.startswith(".")]
-    students = [p.name for p in folders if (p / lab).is_dir() or not (in_place and any(p.iterdir()))]
-    if not students:
-        raise InputError(
-            "submissions", given=str(handed_in), expected=f"<student>/{lab}/ in it", fix="Is it the right folder?"
-        )
-    return students
+class _Run:
+    """One grading run, with everything its steps share."""
 
+    def __init__(
+        self,
+        course: Course,
+        lab: str,
+        folder: Path,
+        sources: Sequence[Path],
+        options: Options,
+        say: Callable[[str], None],
+    ) -> None:
+        self.course, self.lab, self.folder, self.sources = course, lab, folder, sources
+        self.options, self.say = options, say
+        self.kept = course.results / ".executed"
+        self.log = course.results / "nbgrader.log"
 
-def _stage(handed_in: Path, own: Path, lab: str, students: list[str], sources: list[Path], *, in_place: bool) -> None:
-    """Bring the submissions to where nbgrader looks for them, with a placeholder for each missing notebook."""
-    if not in_place:
-        for student in students:
-            shutil.rmtree(own / student / lab, ignore_errors=True)
-            _copy(handed_in / student / lab, own / student / lab)
-    for student in students:
-        for source in sources:
-            path = own / student / lab / source.name
-            if not path.is_file():
-                path.parent.mkdir(parents=True, exist_ok=True)
-                write_text(path, nbformat.writes(intake.placeholder(intake.master_of(source))))
+    def grade(
+        self, students: list[str], progress: Progress | None, confirm: Callable[[list[Change]], bool] | None
+    ) -> ClassResult:
+        _sweep(self.kept, self.course.root / self.course.feedback, self.course.results / "results")
+        if not self.options.dry_run:
+            wait_until_free(self.course.gradebook_url, self.say)
+            backups.backup(self.course.gradebook_url, self.course.results / "backups")
+            generate(self.course, self.lab, log=self.log)
+        with contextlib.ExitStack() as stack:
+            bench = stack.enter_context(open_bench(self.course, self.lab, self.options))
+            journal = self._journal(bench)
+            writer = stack.enter_context(self._writer())
+            entry = Entry(writer, journal, self.kept / "entered" / self.lab)
+            people = self._execute([*students, *self._absent(entry, students)], journal, bench, progress)
+            people, rows = self._postpone(entry, people), Rows(journal, people)
+            changes = [c for p in people if (c := entry.change(p))]
+            if self.options.dry_run or (changes and confirm is not None and not confirm(changes)):
+                return self._result(rows, changes, entered=False)
+            rows = rows.failed([p.student for p in people if not entry.enter(p)])
+            if self.options.feedback:
+                self._feedback(entry, people, rows)
+        result = self._result(rows, changes, entered=True)
+        write_results(result)
+        return result
 
+    def _journal(self, bench: jobs.Bench) -> jobs.Journal:
+        autograder = self.course.autograder
+        tests = [autograder / "hidden", autograder / "profiles", autograder / CONFIG_NAME, self.sources[0].parent]
+        layers = [layer.name for layer in bench.layers if layer.active]
+        return jobs.Journal(self.kept / "cache", jobs.environment_digest(tests, self.options.limits, layers))
 
-def _copy(folder: Path, target: Path) -> None:
-    """Copy the plain files of a submission; links could point at another student's work."""
-    target.mkdir(parents=True, exist_ok=True)
-    for path in sorted(folder.iterdir()) if folder.is_dir() else []:
-        if path.is_file() and not path.is_symlink():
-            shutil.copy(path, target / path.name)
+    @contextlib.contextmanager
+    def _writer(self) -> Iterator[Writer]:
+        """The writer; on a copy of the gradebook where nothing may be written."""
+        with tempfile.TemporaryDirectory(prefix="robotbrain-") as scratch:
+            course = self.course
+            if self.options.dry_run:
+                copy = backups.backup(course.gradebook_url, Path(scratch)) or Path(scratch) / "gradebook.db"
+                course = replace(course, db_url=f"sqlite:///{copy.as_posix()}")
+            with Writer(course, self.lab, log=self.log, on_wait=self.say) as writer:
+                yield writer
 
+    def _absent(self, entry: Entry, students: list[str]) -> list[str]:
+        """Students in the gradebook who handed in nothing; whoever has marks from elsewhere keeps them."""
+        others = sorted(set(student_ids(entry.writer.gradebook)) - set(students))
+        return [s for s in others if entry.was_missing(s) or not entry.standing(s).marked]
 
-def _run_all(
-    tasks: list[_Task], limits: Limits, workers: int, progress: Callable[[int, int, str], None] | None
-) -> dict[int, jobs.Executed]:
-    done: dict[int, jobs.Executed] = {}
-    with ThreadPoolExecutor(max_workers=max(1, workers)) as pool:
-        running = {
-            pool.submit(jobs.run_job, t.healed, t.folder, limits, t.student, t.cache): number
-            for number, t in enumerate(tasks)
-        }
+    def _execute(
+        self, students: list[str], journal: jobs.Journal, bench: jobs.Bench, progress: Progress | None
+    ) -> list[Person]:
+        tasks = roster.tasks(self.folder, self.lab, self.sources, students)
+        found: dict[tuple[str, str], jobs.Done] = {}
+
+        def consume(done: jobs.Done) -> None:
+            found[done.student, done.notebook] = done
+            if progress is not None:
+                progress(len(found), len(tasks), done.student)
+
+        def work(task: jobs.Task) -> jobs.Done:
+            return jobs.grade(self.course, task, journal, bench, fresh=self.options.fresh)
+
         try:
-            for future in as_completed(running):
-                number = running[future]
-                done[number] = future.result()
-                if progress is not None:
-                    progress(len(done), len(tasks), tasks[number].student)
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
+            workers = max(self.options.workers, getattr(bench, "slots", 1))
+            scheduler.run(tasks, work, consume, workers=workers, stop=bench.close)
+        except KeyboardInterrupt:
+            self.say(f"Stopped. {len(found)} of {len(tasks)} submissions are done and kept; the same command goes on.")
             raise
-    return done
+        groups = itertools.groupby(tasks, key=lambda t: (t.student, t.folder))
+        return [Person(s, folder, [found[t.student, t.notebook] for t in own]) for (s, folder), own in groups]
+
+    def _postpone(self, entry: Entry, people: Sequence[Person]) -> list[Person]:
+        """Those whose marks are to be entered: a failure of the machine writes over no mark that is there."""
+        unsound = {p.student for p in people if not all(d.sound for d in p.done)}
+        if unsound:
+            names = ", ".join(sorted(unsound)[:10]) + ("…" if len(unsound) > 10 else "")
+            self.say(f"{len(unsound)} submissions could not be run ({names}); the same command tries them again.")
+        return [p for p in people if p.student not in unsound or not entry.standing(p.student).marked]
+
+    def _feedback(self, entry: Entry, people: Sequence[Person], rows: Rows) -> None:
+        """Write the pages of those for whom anything has changed."""
+        feedback = self.course.root / self.course.feedback
+        outdated = {}
+        for person in people:
+            pages = [feedback / person.student / self.lab / f"{d.notebook}.html" for d in person.done]
+            digest = entry.feedback_digest(person)
+            if entry.noted_feedback(person.student) != digest or not all(p.is_file() for p in pages):
+                outdated[person.student] = digest
+        if not outdated:
+            return
+        names = [source.stem for source in self.sources]
+
+        def notebooks(student: str) -> list[Path]:
+            return [p for n in names if (p := entry.writer.folder(student) / f"{n}.ipynb").is_file()]
+
+        write_feedback(feedback, self.lab, rows.only(outdated), notebooks, self.course.gradebook_url)
+        for student, digest in outdated.items():
+            entry.note_feedback(student, digest)
+
+    def _result(self, rows: Rows, changes: list[Change], *, entered: bool) -> ClassResult:
+        folder = self.course.results / "results" / self.lab
+        feedback = self.course.root / self.course.feedback
+        return ClassResult(self.lab, rows, folder / "results.json", folder / "grades.csv", feedback, changes, entered)
 
 
-def _enter(course: Course, lab: str, tasks: list[_Task], done: dict[int, jobs.Executed], log: Path) -> list[Marks]:
-    """Let nbgrader save the grades and write the feedback; return the marks of each student."""
-    executed = course.results / ".executed" / lab
-    shutil.rmtree(executed, ignore_errors=True)
-    rows: dict[str, Marks] = {}
-    for number, task in enumerate(tasks):
-        result = done[number]
-        write_text(executed / task.student / task.source.name, nbformat.writes(result.notebook))
-        row = rows.setdefault(task.student, Marks(task.student, [], cached=True))
-        row.marks += marks_of(result.notebook)
-        row.incidents += [*task.healed.repairs, *result.incidents]
-        row.seconds += result.seconds
-        row.cached = row.cached and result.cached
-    submitted = course.root / course.submitted
-    settings = {
-        "ResilientExecute__executed_directory": str(executed),
-        # Nbgrader takes one student or all; whoever else is in the folder from an earlier run is left as is.
-        "CourseDirectory__student_id_exclude": ",".join(p.name for p in submitted.iterdir() if p.name not in rows),
-    }
-    error = run_nbgrader(course, "Autograde", lab, log=log, **settings)
-    if error:
-        _zero_where_missing(course, lab, list(rows.values()))
-    run_nbgrader(course, "GenerateFeedback", lab, log=log, **settings)
-    return list(rows.values())
+def open_bench(course: Course, lab: str, options: Options) -> Any:
+    """What runs the submissions: a Bench here, or those of a cluster's workers."""
+    if options.cluster:
+        from robotbrain.grading.cluster import ClusterBench
+
+        return ClusterBench(
+            options.cluster, course, lab, limits=options.limits, require_sandbox=options.require_sandbox
+        )
+    from robotbrain.grading.bench import Bench
+
+    return Bench(course.autograder, require_sandbox=options.require_sandbox, limits=options.limits, preload_labs=[lab])
 
 
-def _zero_where_missing(course: Course, lab: str, rows: list[Marks]) -> None:
-    """Give students whom nbgrader itself could not grade an explicit zero with its reason."""
-    from nbgrader.api import Gradebook
-
-    for row in rows:
-        if (course.root / course.autograded / row.student / lab).is_dir():
-            continue
-        row.incidents.append("nbgrader could not process this submission (see nbgrader.log)")
-        with Gradebook(course.gradebook_url) as gradebook:
-            gradebook.update_or_create_student(row.student)
-            submission = gradebook.update_or_create_submission(lab, row.student)
-            for notebook in submission.notebooks:
-                for grade in notebook.grades:
-                    grade.auto_score, grade.needs_manual_grade = 0, False
-            gradebook.db.commit()
-        for mark in row.marks:
-            mark.earned, mark.error = 0.0, "not processed"
-
-
-def _write(course: Course, lab: str, rows: list[Marks]) -> ClassResult:
-    folder = course.results / "results" / lab
-    result = ClassResult(lab, rows, folder / "results.json", folder / "grades.csv", course.root / course.feedback)
-    write_text(result.results, json.dumps(result.to_dict(), indent=1, ensure_ascii=False) + "\n")
-    write_text(result.table, csv_text(rows))
-    return result
-
-
-def feedback_page(result: ClassResult, student: str) -> Path | None:
-    """The first feedback page of ``student``, or None if nbgrader made none."""
-    return next(iter(sorted((result.feedback / student / result.lab).glob("*.html"))), None)
+def _sweep(*folders: Path) -> None:
+    """Remove the unfinished files of a run that was killed."""
+    for folder in folders:
+        for path in folder.rglob(".*.tmp"):
+            path.unlink(missing_ok=True)
 
 
 def grade_notebook(
-    course: Course, path: Path, *, lab: str | None = None, student: str = "", limits: Limits | None = None
+    course: Course, path: Path, *, lab: str | None = None, student: str = "", options: Options | None = None
 ) -> Marks:
     """Grade one notebook with the same machinery and leave nothing behind.
 
@@ -242,17 +262,21 @@ def grade_notebook(
     """
     if not path.is_file():
         raise InputError("notebook", given=str(path), expected="an existing file", fix="Check the path.")
-    sources = [s for name in ([lab] if lab else course.labs()) for s in course.sources(name)]
-    source = next((s for s in sources if s.name == path.name), sources[0] if lab and len(sources) == 1 else None)
-    if source is None:
+    found = [(name, s) for name in ([lab] if lab else course.labs()) for s in course.sources(name)]
+    right = [pair for pair in found if pair[1].name == path.name] or (found if lab and len(found) == 1 else [])
+    if not right:
         raise InputError(
             "notebook",
             given=path.name,
-            expected=f"one of {', '.join(s.name for s in sources) or '(no labs)'}",
+            expected=f"one of {', '.join(s.name for _, s in found) or '(no labs)'}",
             fix="Name the lab with --lab.",
         )
+    (name, source), options = right[0], options or Options()
     os.environ[AUTOGRADER_VARIABLE] = str(course.autograder)
+    path = path.resolve()  # a teacher may name a link; the gate follows none
     healed = intake.heal(path, intake.master_of(source))
-    result = jobs.run_job(healed, path.parent, limits or Limits(), student, None)
-    incidents = [*healed.repairs, *result.incidents]
-    return Marks(student or path.stem, marks_of(result.notebook), incidents, result.seconds)
+    files = jobs.received(course, path.parent).further()
+    with open_bench(course, name, options) as bench:
+        run = jobs.run_job(healed, files, lab=name, student=student, bench=bench)
+    incidents = [*healed.repairs, *run.incidents]
+    return Marks(student or path.stem, marks_of(run.notebook), incidents, run.seconds, layers=run.layers)

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import importlib.util
 import logging
 import os
 import shutil
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from traitlets.config import Config, PyFileConfigLoader
 
-from robotbrain.errors import InputError, RobotBrainError
+from robotbrain.errors import InputError, MissingDependencyError, RobotBrainError
 from robotbrain.grading.suite import AUTOGRADER_VARIABLE
 
 CONFIG_NAME = "nbgrader_config.py"
+_LONGEST_LOCK_S = 3600
 
 
 @dataclass(frozen=True)
@@ -25,6 +27,7 @@ class Course:
     Attributes:
         home: the repository: it holds ``solutions/``, ``labs/`` and ``autograder/``.
         root: nbgrader's course folder; ``home`` itself, or the folder of an isolated grading run.
+        db_url: SQLAlchemy address of the gradebook; ``""``: the SQLite file ``database``.
     """
 
     home: Path
@@ -35,6 +38,7 @@ class Course:
     autograded: str = "autograder/autograded"
     feedback: str = "autograder/feedback"
     database: str = "autograder/gradebook.db"
+    db_url: str = ""
 
     @property
     def autograder(self) -> Path:
@@ -49,7 +53,14 @@ class Course:
     @property
     def gradebook_url(self) -> str:
         """SQLAlchemy address of the gradebook."""
-        return f"sqlite:///{(self.root / self.database).as_posix()}"
+        return self.db_url or f"sqlite:///{(self.root / self.database).as_posix()}"
+
+    def with_gradebook(self, db_url: str | None = None) -> Course:
+        """This course with the gradebook at ``db_url``; default: the one its own ``nbgrader_config.py`` names."""
+        if db_url is None and self.root == self.home:
+            configured = _instructors_config(self).CourseDirectory.get("db_url", "")
+            db_url = configured if isinstance(configured, str) else ""
+        return replace(self, db_url=driver_url(db_url)) if db_url else self
 
     def labs(self) -> list[str]:
         """Names of the labs that have a source."""
@@ -89,17 +100,43 @@ def find_course(start: str | Path | None = None) -> Course:
     )
 
 
+def driver_url(url: str) -> str:
+    """``url`` with a PostgreSQL driver that is installed.
+
+    SQLAlchemy 2.1 takes ``postgresql://`` for psycopg 3; before, it was psycopg2, which is what most courses have.
+    """
+    scheme, separator, rest = url.partition("://")
+    if scheme not in ("postgres", "postgresql") or importlib.util.find_spec("psycopg"):
+        return url.replace("postgres://", "postgresql://", 1)
+    if importlib.util.find_spec("psycopg2") is None:
+        raise MissingDependencyError(
+            "psycopg2", needed_for="a gradebook in PostgreSQL", install="pip install psycopg2-binary"
+        )
+    return f"postgresql+psycopg2{separator}{rest}"
+
+
+def patient_url(url: str) -> str:
+    """``url`` such that nbgrader's own steps wait for a locked SQLite gradebook; they give up after 5 s by default."""
+    if not url.startswith("sqlite") or "timeout=" in url:
+        return url
+    return f"{url}{'&' if '?' in url else '?'}timeout={_LONGEST_LOCK_S}"
+
+
+def _instructors_config(course: Course) -> Config:
+    os.environ[AUTOGRADER_VARIABLE] = str(course.autograder)
+    return PyFileConfigLoader(CONFIG_NAME, path=str(course.autograder)).load_config()
+
+
 def nbgrader_config(course: Course) -> Config:
     """The instructor's own nbgrader configuration, with the folders of ``course``."""
-    os.environ[AUTOGRADER_VARIABLE] = str(course.autograder)
-    config = PyFileConfigLoader(CONFIG_NAME, path=str(course.autograder)).load_config()
+    config = _instructors_config(course)
     directory = config.CourseDirectory
     directory.root = str(course.root)
     directory.source_directory, directory.release_directory = course.source, course.release
     directory.submitted_directory = course.submitted
     directory.autograded_directory = course.autograded
     directory.feedback_directory = course.feedback
-    directory.db_url = course.gradebook_url
+    directory.db_url = patient_url(course.gradebook_url)
     return config
 
 
@@ -122,7 +159,7 @@ def run_nbgrader(course: Course, step: str, lab: str, *, log: Path | None = None
     for name, value in settings.items():
         section, _, trait = name.partition("__")
         config[section][trait] = value
-    logger, handler = _logger(log)
+    logger, handler = nbgrader_logger(log)
     (course.root / course.database).parent.mkdir(parents=True, exist_ok=True)
     try:
         directory = CourseDirectory(config=config, log=logger)
@@ -142,7 +179,8 @@ def run_nbgrader(course: Course, step: str, lab: str, *, log: Path | None = None
         handler.close()
 
 
-def _logger(log: Path | None) -> tuple[logging.Logger, logging.Handler]:
+def nbgrader_logger(log: Path | None) -> tuple[logging.Logger, logging.Handler]:
+    """A logger for nbgrader's messages and the handler that writes them to ``log``; remove and close that later."""
     logger = logging.getLogger("robotbrain.nbgrader")
     logger.setLevel(logging.INFO)
     logger.propagate = False

@@ -33,7 +33,14 @@ def findings() -> list[tuple[bool, bool, str]]:
     found.append((extensions.is_dir(), False, "nbgrader's JupyterLab extension (Validate button, formgrader)"))
     browser = next((b for b in _BROWSERS if shutil.which(b)), None)
     found.append((browser is not None, False, f"a Chromium browser for the browser tests ({browser or 'none found'})"))
-    return found
+    return found + sandbox_findings()
+
+
+def sandbox_findings() -> list[tuple[bool, bool, str]]:
+    """What shuts student code in while grading on this host; only teachers need it."""
+    from robotbrain.grading.bench import host_layers
+
+    return [(layer.active, False, f"grading sandbox, {layer.name}: {layer.note}") for layer in host_layers()]
 
 
 def main(arguments: argparse.Namespace) -> int:

@@ -7,6 +7,7 @@ likely mistake, hint". They are ordinary assertions: pytest understands them too
 from __future__ import annotations
 
 import reprlib
+import sys
 from typing import Any
 
 _MISSING: Any = object()
@@ -43,16 +44,34 @@ class CheckFailure(AssertionError):  # noqa: N818 - a student's failure, not a p
         self.hint, self.misconception, self.credit = hint, misconception, credit
 
 
+class CannotCrossError(TypeError):
+    """A test hands student code something that cannot be sent to the student's process."""
+
+
 def show(value: Any, limit: int = _LONGEST) -> str:
     """Return ``value`` as short readable text; never raises, whatever the object's ``__repr__`` does."""
     if isinstance(value, str):
         text = value
     else:
         try:
-            text = _show_array(value) if hasattr(value, "shape") and hasattr(value, "dtype") else _REPR.repr(value)
+            is_array = not _is_proxy(value) and hasattr(value, "shape") and hasattr(value, "dtype")
+            text = _show_array(value) if is_array else _REPR.repr(value)
         except Exception as error:
-            text = f"<{type(value).__name__} whose repr raises {type(error).__name__}>"
+            text = f"<{type_name(value)} whose repr raises {type(error).__name__}>"
     return text if len(text) <= limit else text[: limit - 1] + "…"
+
+
+def _is_proxy(value: Any) -> bool:
+    """Whether ``value`` stands for an object of the student's process, which must not be asked what it is."""
+    proxies = sys.modules.get("robotbrain.grading.remote.proxies")  # without this module there are none
+    return proxies is not None and type(value) is proxies.Proxy
+
+
+def type_name(value: Any) -> str:
+    """The name of a value's type; while grading, of a student's object the name that its process gave."""
+    return (
+        sys.modules["robotbrain.grading.remote.proxies"].type_name(value) if _is_proxy(value) else type(value).__name__
+    )
 
 
 class _Repr(reprlib.Repr):
@@ -76,6 +95,12 @@ def _show_array(value: Any) -> str:
     array = np.asarray(value)
     body = np.array2string(array, precision=5, threshold=20, edgeitems=3, separator=", ", max_line_width=76)
     return body if array.ndim == 0 else f"{body}  (shape {array.shape}, {array.dtype})"
+
+
+def readable(text: str) -> str:
+    """``text`` without what cannot be written to a file or would steer a terminal."""
+    printable = (c if c.isprintable() or c in "\n\t" else "\ufffd" for c in text)
+    return "".join(printable)
 
 
 def fail(
@@ -166,7 +191,7 @@ def expect_close(
     except Exception:
         wanted = "a number" if target.ndim == 0 else f"numbers of shape {target.shape}"
         fail(
-            f"{what} should be {wanted}, but is of type {type(got).__name__}",
+            f"{what} should be {wanted}, but is of type {type_name(got)}",
             expected=expected,
             got=got,
             **kept,

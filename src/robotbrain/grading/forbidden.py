@@ -10,7 +10,21 @@ from collections.abc import Iterator, Mapping
 from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
-from robotbrain.grading.suite import Ban
+from robotbrain.grading.suite import Ban, Suite
+
+
+def why_exercise_forbidden(exercise: str, suite: Suite, namespace: Mapping[str, Any]) -> str:
+    """Return why the answer to ``exercise`` in a notebook is not acceptable, or ``""`` if it is."""
+    ban = suite.ban_of(exercise)
+    own = suite.exercises[exercise].provides
+    others = frozenset(name for entry in suite.exercises.values() for name in entry.provides if name not in own)
+    for name in own:
+        if name in namespace:
+            reference = suite.load_reference(name) if name in suite.references else None
+            reason = why_forbidden(name, namespace[name], reference, ban, namespace, others)
+            if reason:
+                return reason
+    return ""
 
 
 def why_forbidden(
@@ -28,10 +42,10 @@ def why_forbidden(
     """
     if reference is not None and answer is reference:
         return f"`{name}` is the course's own solution; write your own"
-    if _module_banned(getattr(answer, "__module__", None), ban):
+    if module_banned(getattr(answer, "__module__", None), ban):
         return f"`{name}` comes from `{answer.__module__}`, which is the course's own solution; write your own"
     for base in answer.__mro__[1:] if isinstance(answer, type) else ():
-        if base is reference or (_module_banned(base.__module__, ban) and base.__name__ not in ban.allow):
+        if base is reference or (module_banned(base.__module__, ban) and base.__name__ not in ban.allow):
             return f"`{name}` inherits from `{base.__module__}.{base.__name__}`, the course's own solution"
     seen: set[int] = set()
     todo = list(_functions(answer))
@@ -41,7 +55,7 @@ def why_forbidden(
             continue
         seen.add(id(function))
         for code in _codes(function.__code__):
-            imported = next((n for n in (*code.co_names, *_strings(code)) if _module_banned(n, ban)), None)
+            imported = next((n for n in (*code.co_names, *_strings(code)) if module_banned(n, ban)), None)
             if imported:
                 return (
                     f"`{name}` imports `{imported}`, which holds the course's own solution; write your own"
@@ -51,19 +65,20 @@ def why_forbidden(
                 if used in others:
                     continue
                 value = function.__globals__.get(used)
-                if isinstance(value, ModuleType) and _module_banned(value.__name__, ban):
+                if isinstance(value, ModuleType) and module_banned(value.__name__, ban):
                     return f"`{name}` uses the module `{value.__name__}`, which holds the course's own solution"
                 if value is not None and value is reference:
                     return f"`{name}` uses `{used}`, which is the course's own solution; write your own"
                 if isinstance(value, FunctionType):
-                    if _module_banned(value.__module__, ban) and value.__name__ not in ban.allow:
+                    if module_banned(value.__module__, ban) and value.__name__ not in ban.allow:
                         return f"`{name}` calls `{value.__module__}.{value.__name__}`, the course's own solution"
                     if value.__globals__ is namespace:
                         todo.append(value)
     return ""
 
 
-def _module_banned(module: object, ban: Ban) -> bool:
+def module_banned(module: object, ban: Ban) -> bool:
+    """Whether this is the name of a banned module, or of something in one."""
     return isinstance(module, str) and any(module == b or module.startswith(b + ".") for b in ban.imports)
 
 

@@ -21,8 +21,12 @@ from typing import Any
 _AGAIN_S = 0.1  # raised again at this interval while the code swallows it
 
 
-class TimeLimitError(BaseException):
-    """The time limit passed. Not an ``Exception``: student code that catches everything should not catch this."""
+class EndedFromOutsideError(BaseException):
+    """Something ended a test from outside. Not an ``Exception``: code that catches everything should not catch this."""
+
+
+class TimeLimitError(EndedFromOutsideError):
+    """The time limit passed."""
 
 
 @contextlib.contextmanager

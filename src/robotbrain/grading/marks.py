@@ -5,13 +5,14 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from nbformat.notebooknode import NotebookNode
 from nbgrader.utils import determine_grade, is_grade
 
+from robotbrain.grading.expect import readable
 from robotbrain.grading.report import SCORE_MIME
 
 SCORED = re.compile(r"""\.score\(\s*["'](\w+)["']""")
@@ -56,6 +57,7 @@ class Marks:
     Attributes:
         incidents: repairs of the file and events while it ran.
         seconds: wall time of the run (s).
+        layers: sandbox layers that were active while it ran; empty: none was; None: not known.
     """
 
     student: str
@@ -63,6 +65,7 @@ class Marks:
     incidents: list[str] = field(default_factory=list)
     seconds: float = 0.0
     cached: bool = False
+    layers: list[str] | None = None
 
     @property
     def earned(self) -> float:
@@ -102,6 +105,7 @@ class Marks:
             "incidents": self.incidents,
             "seconds": round(self.seconds, 2),
             "cached": self.cached,
+            "layers": self.layers,
             "exercises": [
                 {
                     "grade_id": m.grade_id,
@@ -115,6 +119,14 @@ class Marks:
                 for m in self.marks
             ],
         }
+
+    @classmethod
+    def from_dict(cls, stored: Mapping[str, Any]) -> Marks:
+        """The marks that :meth:`to_dict` wrote."""
+        fields = ("grade_id", "exercise", "points", "earned", "tests", "substituted", "error")
+        marks = [Mark(**{name: exercise[name] for name in fields}) for exercise in stored["exercises"]]
+        kept = ("student", "incidents", "seconds", "cached", "layers")
+        return cls(marks=marks, **{name: stored[name] for name in kept})
 
 
 def marks_of(notebook: NotebookNode) -> list[Mark]:
@@ -143,19 +155,21 @@ def columns(rows: Sequence[Marks]) -> list[str]:
     return list(dict.fromkeys(m.exercise for row in rows for m in row.marks))
 
 
-def table(rows: Sequence[Marks], *, widest_reason: int = 70) -> str:
+def table(rows: Iterable[Marks], *, widest_reason: int = 70) -> str:
     """The class as text: student, points per exercise, total, verdict, seconds, reason."""
-    names = columns(rows)
-    worth = {m.exercise: m.points for row in rows for m in row.marks}
-    total = max((row.points for row in rows), default=0.0)
-    head = ["student", *(f"{n}/{worth[n]:g}" for n in names), f"total/{total:g}", "verdict", "s", "reason"]
-    body = []
-    for row in rows:
+    worth: dict[str, float] = {}
+    total, cached = 0.0, False
+    lists = []
+    for row in rows:  # once: the rows of a large class are read from files
+        worth |= {m.exercise: m.points for m in row.marks}
+        total, cached = max(total, row.points), cached or row.cached
         reason = row.reason()
         reason = reason if len(reason) <= widest_reason else reason[: widest_reason - 1] + "…"
-        points = [_shown(row, name) for name in names]
-        seconds = f"{row.seconds:.1f}{'*' if row.cached else ''}"
-        body.append([row.student, *points, f"{row.earned:g}", row.verdict, seconds, reason])
+        rest = [f"{row.earned:g}", row.verdict, f"{row.seconds:.1f}{'*' if row.cached else ''}", reason]
+        lists.append((row.student, _shown(row), rest))
+    names = list(worth)
+    head = ["student", *(f"{n}/{worth[n]:g}" for n in names), f"total/{total:g}", "verdict", "s", "reason"]
+    body = [[_plain(c) for c in (who, *(points.get(n, "-") for n in names), *rest)] for who, points, rest in lists]
     widths = [max(len(line[i]) for line in [head, *body]) for i in range(len(head))]
     numeric = set(range(1, len(names) + 2)) | {len(names) + 3}
     lines = [head, ["-" * w for w in widths], *body]
@@ -164,27 +178,42 @@ def table(rows: Sequence[Marks], *, widest_reason: int = 70) -> str:
         for line in lines
     )
     text = "\n".join(line.rstrip() for line in text.splitlines())
-    return text + ("\n* from an earlier run" if any(row.cached for row in rows) else "")
+    return text + ("\n* from an earlier run" if cached else "")
 
 
-def _shown(row: Marks, exercise: str) -> str:
-    found = [m.earned for m in row.marks if m.exercise == exercise]
-    return "by hand" if None in found else f"{sum(e or 0.0 for e in found):g}" if found else "-"
+def _shown(row: Marks) -> dict[str, str]:
+    """Points by exercise, as text."""
+    found: dict[str, list[float | None]] = {}
+    for mark in row.marks:
+        found.setdefault(mark.exercise, []).append(mark.earned)
+    return {n: "by hand" if None in e else f"{sum(x or 0.0 for x in e):g}" for n, e in found.items()}
 
 
-def csv_text(rows: Sequence[Marks]) -> str:
+def csv_text(rows: Iterable[Marks]) -> str:
     """The class as CSV."""
-    names = columns(rows)
+    names: dict[str, None] = {}
+    lists = []
+    for row in rows:
+        points = _shown(row)
+        names |= dict.fromkeys(points)
+        rest = [row.earned, row.points, row.verdict, round(row.seconds, 2), row.reason()]
+        lists.append((row.student, points, rest))
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(["student", *names, "total", "max", "verdict", "seconds", "reason"])
-    for row in rows:
-        points = [_shown(row, name) for name in names]
-        values = [row.student, *points, row.earned, row.points, row.verdict, round(row.seconds, 2), row.reason()]
-        writer.writerow([_harmless(v) for v in values])
+    for who, points, rest in lists:
+        writer.writerow([_harmless(v) for v in (who, *(points.get(n, "-") for n in names), *rest)])
     return out.getvalue()
 
 
 def _harmless(value: object) -> object:
     """Keep a spreadsheet from reading a text of the student's as a formula."""
-    return f"'{value}" if isinstance(value, str) and value[:1] in "=+-@\t\r" and len(value) > 1 else value
+    if not isinstance(value, str):
+        return value
+    text = _plain(value)
+    return f"'{text}" if text[:1] in "=+-@" and len(text) > 1 else text
+
+
+def _plain(text: str) -> str:
+    """A text of the student's on one line, without what would steer a terminal."""
+    return " ".join(readable(text).split("\n")).replace("\t", " ")

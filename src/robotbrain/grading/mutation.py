@@ -14,6 +14,8 @@ class Row:
     """What became of one sample submission.
 
     Attributes:
+        lost: points lost in all.
+        own: points lost in the exercise that the mistake is in.
         killers: names of the tests that found its mistake.
         problems: how it differs from what it should be; empty if it does not.
     """
@@ -22,6 +24,7 @@ class Row:
     kind: str
     name: str
     lost: float
+    own: float
     killers: tuple[str, ...]
     hints: tuple[str, ...]
     problems: tuple[str, ...]
@@ -33,7 +36,7 @@ def judge(results: Mapping[str, Any], manifest: Mapping[str, Mapping[str, Any]])
     rows = []
     for student, entry in manifest.items():
         if student not in graded:
-            rows.append(Row(student, entry["kind"], entry["name"], 0.0, (), (), ("has no grade",)))
+            rows.append(Row(student, entry["kind"], entry["name"], 0.0, 0.0, (), (), ("has no grade",)))
             continue
         rows.append(_judge_one(graded[student], entry))
     return rows
@@ -49,7 +52,8 @@ def _judge_one(result: Mapping[str, Any], entry: Mapping[str, Any]) -> Row:
         problems += _exercise_problems(entry, losses, own)
     hints = tuple(dict.fromkeys(t["hint_key"] for t in own if t["hint_key"]))
     killers = tuple(f"{t['exercise']}: {t['name']}" for t in own)
-    return Row(result["student"], entry["kind"], entry["name"], lost, killers, hints, tuple(problems))
+    suffered = losses.get(entry.get("exercise", ""), 0.0)
+    return Row(result["student"], entry["kind"], entry["name"], lost, suffered, killers, hints, tuple(problems))
 
 
 def _total_problems(expect: str, result: Mapping[str, Any], losses: Mapping[str, float]) -> list[str]:
@@ -86,15 +90,21 @@ def _exercise_problems(
 
 def idle_tests(results: Mapping[str, Any], rows: Sequence[Row]) -> list[str]:
     """Tests that find no mutant: either useless, or their mistake has no mutant yet."""
-    every = dict.fromkeys(
-        f"{t['exercise']}: {t['name']}" for s in results["students"] for e in s["exercises"] for t in e["tests"]
-    )
     busy = {killer for row in rows if row.kind == "mutant" for killer in row.killers}
-    return [name for name in every if name not in busy]
+    return [name for name in test_names(results) if name not in busy]
+
+
+def test_names(results: Mapping[str, Any]) -> list[str]:
+    """All tests that ran, as ``exercise: name``, in order."""
+    tests = (t for s in results["students"] for e in s["exercises"] for t in e["tests"])
+    return list(dict.fromkeys(f"{t['exercise']}: {t['name']}" for t in tests))
+
+
+test_names.__test__ = False  # type: ignore[attr-defined]  # the name begins with "test", but pytest need not call it
 
 
 def table(rows: Sequence[Row]) -> str:
-    """The outcome as text."""
+    """The outcome as text: one line per submission, what is wrong below it."""
     lines = []
     width = max((len(f"{r.kind} {r.name}") for r in rows), default=0)
     for row in rows:

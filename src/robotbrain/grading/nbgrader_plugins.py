@@ -6,18 +6,20 @@ else (overwriting of locked cells, the gradebook, formgrader, feedback) stays st
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
-import nbformat
 from nbconvert.exporters import NotebookExporter
 from nbformat.notebooknode import NotebookNode
 from nbgrader.preprocessors import NbGraderPreprocessor
-from traitlets import Float, Integer, Unicode
+from traitlets import Bool, Float, Integer
 
 from robotbrain.grading import intake
-from robotbrain.grading.execute import Limits, execute_notebook, make_gradable
-from robotbrain.grading.student import STUDENT_VARIABLE
+from robotbrain.grading.bench import shared_bench
+from robotbrain.grading.execute import Limits
+from robotbrain.grading.sandbox.layers import warning_of
+from robotbrain.grading.suite import AUTOGRADER_VARIABLE
 from robotbrain.notebooks import canonicalise
 
 
@@ -29,41 +31,26 @@ class ResilientExecute(NbGraderPreprocessor):  # type: ignore[misc]
     grace = Float(Limits.grace_s, help="Seconds between interrupt and kill.").tag(config=True)
     wall = Float(Limits.wall_s, help="Seconds the whole notebook may take.").tag(config=True)
     output_bytes = Integer(Limits.output_bytes, help="Bytes of output kept of one cell.").tag(config=True)
-    executed_directory = Unicode(
-        "", help="Folder of notebooks already executed by `robotbrain grade-class`: <student>/<notebook>.ipynb."
-    ).tag(config=True)
+    require_sandbox = Bool(False, help="Refuse to run where the host cannot shut student code in.").tag(config=True)
 
     def limits(self) -> Limits:
         """The configured limits."""
         return Limits(self.timeout, self.graded_timeout, self.grace, self.wall, self.output_bytes)
 
     def preprocess(self, nb: NotebookNode, resources: dict[str, Any]) -> tuple[NotebookNode, dict[str, Any]]:
-        """Execute ``nb``, or take its outputs from a run of the very same cells."""
+        """Execute ``nb`` on the bench that this process keeps for all submissions."""
         names = resources.get("nbgrader", {})
-        student, notebook = names.get("student", ""), names.get("notebook", "")
-        path = Path(self.executed_directory) / student / f"{notebook}.ipynb"
-        if self.executed_directory and path.is_file():
-            executed = nbformat.read(path, as_version=4)
-            if take_outputs(nb, executed):
-                return nb, resources
-            self.log.warning("The executed notebook of %s does not match its submission; running it now", student)
-        cwd = Path(resources.get("metadata", {}).get("path") or Path.cwd())
-        run = execute_notebook(nb, cwd=cwd, limits=self.limits(), extra_env={STUDENT_VARIABLE: student})
+        student, lab = names.get("student", ""), names.get("assignment", "")
+        folder = Path(resources.get("metadata", {}).get("path") or Path.cwd())
+        autograder = Path(os.environ.get(AUTOGRADER_VARIABLE) or Path.cwd())
+        bench = shared_bench(autograder, self.limits(), require_sandbox=self.require_sandbox, lab=lab)
+        run = bench.execute(nb, lab=lab, student=student, files=intake.receive(folder).further())
         for incident in run.incidents:
             self.log.warning("%s: %s", student, incident)
+        warning = warning_of(run.layers)
+        if warning:
+            self.log.warning("%s: %s", student, warning)
         return nb, resources
-
-
-def take_outputs(nb: NotebookNode, executed: NotebookNode) -> bool:
-    """Copy outputs from ``executed`` into ``nb`` if both have the same code cells; return whether they have."""
-    mine = [c for c in nb.cells if c.cell_type == "code"]
-    theirs = [c for c in executed.cells if c.cell_type == "code"]
-    if [c.source for c in mine] != [c.source for c in theirs]:
-        return False
-    for cell, done in zip(mine, theirs, strict=True):
-        cell.outputs, cell.execution_count = done.outputs, done.execution_count
-        make_gradable(cell)
-    return True
 
 
 class CanonicalForm(NbGraderPreprocessor):  # type: ignore[misc]

@@ -3,29 +3,22 @@
 from __future__ import annotations
 
 import builtins
-import contextlib
-import io
 import linecache
 import os
-import random
-import sys
 import time
-import traceback
-import warnings
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from types import TracebackType
 from typing import Any
 
-from robotbrain.grading import journal
-from robotbrain.grading.expect import CheckFailure, show
-from robotbrain.grading.limits import TimeLimitError, time_limit
+from robotbrain.grading.expect import CannotCrossError, CheckFailure, readable, show
+from robotbrain.grading.limits import EndedFromOutsideError, TimeLimitError, time_limit
+from robotbrain.grading.quiet import BoundedText, quiet, seeded
 from robotbrain.grading.results import TestResult, Verdict
 from robotbrain.grading.student import Student
 from robotbrain.grading.suite import Suite, Test
 
 TIME_SCALE_VARIABLE = "ROBOTBRAIN_TIME_SCALE"
-_KEPT_OUTPUT = 2_000  # characters of a test's prints that a report may show
 
 
 class _BrokenTestError(Exception):
@@ -40,12 +33,27 @@ class Interruption:
 
 
 @dataclass
-class _Outcome:
+class Outcome:
+    """How one test ended.
+
+    Attributes:
+        fraction: of the test's points.
+        failure: what the test raised, where it found a mistake.
+    """
+
     verdict: Verdict
     fraction: float = 0.0
     message: str = ""
     failure: CheckFailure | None = None
-    fields: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where in the notebook's code an exception arose: ``function``, its ``line`` and that line's ``text``."""
+
+    function: str
+    line: int
+    text: str
 
 
 def time_scale() -> float:
@@ -59,54 +67,63 @@ def time_scale() -> float:
 def run_test(
     test: Test, suite: Suite, student: Student, namespace: Mapping[str, Any], interruption: Interruption
 ) -> TestResult:
-    """Run one test; whatever the student's code does short of ending the process becomes a result."""
-    if journal.crashed_before(test.exercise, test.name):
-        outcome = _Outcome(Verdict.CRASHED, message="your code ended the Python process during this test")
-        return _result(test, suite, outcome, "", 0.0)
+    """Run one test in this process; whatever the student's code does short of ending it becomes a result."""
     if interruption.happened:
-        outcome = _Outcome(Verdict.TIMEOUT, message="not run: the time for this cell was used up")
-        return _result(test, suite, outcome, "", 0.0)
-    journal.begun(test.exercise, test.name)
+        return result_of(test, suite, Outcome(Verdict.TIMEOUT, message="not run: the time for this cell was used up"))
     limit = test.time_limit_s * time_scale()
-    output = _BoundedText(_KEPT_OUTPUT)
+    output = BoundedText()
     start = time.perf_counter()
-    try:
-        with _quiet(output), _seeded(suite.name, test.name):
-            outcome = _judge(test, student, namespace, limit, interruption)
-    finally:
-        journal.ended(test.exercise, test.name)
-    return _result(test, suite, outcome, output.getvalue(), time.perf_counter() - start)
+    with quiet(output), seeded(suite.name, test.name):
+        outcome = _judge_here(test, student, namespace, limit, interruption)
+    return result_of(test, suite, outcome, output.getvalue(), time.perf_counter() - start)
 
 
-def _judge(
+def _judge_here(
     test: Test, student: Student, namespace: Mapping[str, Any], limit: float, interruption: Interruption
-) -> _Outcome:
+) -> Outcome:
     try:
         with time_limit(limit):
-            answer = test.function(student)
-        return _from_return(answer)
-    except CheckFailure as failure:
-        fraction = min(1.0, max(0.0, failure.credit))
-        return _Outcome(Verdict.FAILED, fraction, failure.message, failure)
+            return judge(test, student, lambda error: _last_student_place(error.__traceback__, namespace))
     except TimeLimitError:
-        return _Outcome(Verdict.TIMEOUT, message=f"did not finish in {limit:g} s: is there a loop that never ends?")
+        return timed_out(limit)
     except KeyboardInterrupt:
         if os.environ.get("NBGRADER_EXECUTION") != "autograde":
             raise  # a person pressed stop
         interruption.happened = True
-        return _Outcome(Verdict.TIMEOUT, message="was running when the time for this cell was used up")
+        return Outcome(Verdict.TIMEOUT, message="was running when the time for this cell was used up")
+
+
+def timed_out(limit: float) -> Outcome:
+    """The outcome of a test that took longer than ``limit`` (s)."""
+    return Outcome(Verdict.TIMEOUT, message=f"did not finish in {limit:g} s: is there a loop that never ends?")
+
+
+def judge(test: Test, student: Student, place_of: Callable[[BaseException], Place | None]) -> Outcome:
+    """Call a test and say how it ended.
+
+    Only what ends a test from outside (a time limit, a keyboard interrupt, the end of the student's process) is raised.
+
+    Args:
+        place_of: where in the notebook's code an exception arose, if it arose there.
+    """
+    try:
+        return _from_return(test.function(student))
+    except (EndedFromOutsideError, KeyboardInterrupt):
+        raise
+    except CheckFailure as failure:
+        return Outcome(Verdict.FAILED, min(1.0, max(0.0, failure.credit)), failure.message, failure)
     except MemoryError:
-        return _Outcome(Verdict.MEMORY, message="needed more memory than there is")
+        return Outcome(Verdict.MEMORY, message="needed more memory than there is")
     except NotImplementedError as error:
-        frame = _last_student_frame(error.__traceback__, namespace)
-        return _Outcome(Verdict.NOT_WRITTEN, message=f"{frame.name if frame else 'this part'} is not written yet")
+        place = None if test.hidden else place_of(error)
+        return Outcome(Verdict.NOT_WRITTEN, message=f"{place.function if place else 'this part'} is not written yet")
     except BaseException as error:
-        return _from_exception(error, namespace, hidden=test.hidden)
+        return _from_exception(error, place_of(error), hidden=test.hidden)
 
 
-def _from_return(answer: Any) -> _Outcome:
+def _from_return(answer: Any) -> Outcome:
     if answer is None:
-        return _Outcome(Verdict.PASSED, 1.0)
+        return Outcome(Verdict.PASSED, 1.0)
     try:
         fraction = float(answer)
     except (TypeError, ValueError):
@@ -114,61 +131,69 @@ def _from_return(answer: Any) -> _Outcome:
     if not 0.0 <= fraction <= 1.0:
         raise _BrokenTestError(f"it returned {show(answer)}, not a fraction in [0, 1]")
     if fraction > 1.0 - 1e-9:
-        return _Outcome(Verdict.PASSED, 1.0)
-    return _Outcome(Verdict.FAILED, fraction, f"{fraction:.0%} of this test is fulfilled")
+        return Outcome(Verdict.PASSED, 1.0)
+    return Outcome(Verdict.FAILED, fraction, f"{fraction:.0%} of this test is fulfilled")
 
 
-def _from_exception(error: BaseException, namespace: Mapping[str, Any], *, hidden: bool) -> _Outcome:
-    name = type(error).__name__
-    if hidden and getattr(builtins, name, None) is not type(error):
-        name = "an exception"  # a made-up class name could carry out what a hidden test passed in
-    frame = _last_student_frame(error.__traceback__, namespace)
+def _from_exception(error: BaseException, place: Place | None, *, hidden: bool) -> Outcome:
+    if isinstance(error, SystemExit):
+        return Outcome(Verdict.ERROR, message="your code called exit(); return a value instead")
+    # All that a hidden test says of it is the builtin type: names, texts and lines of the student's choice could
+    # carry out what the test passed in.
+    name = builtin_name(error) if hidden else str(getattr(error, "type_name", "") or type(error).__name__)
     try:
         said = " ".join(str(error).split())
     except Exception:
         said = ""
     detail = "" if hidden or not said else f": {show(said, 200)}"
-    if isinstance(error, SystemExit):
-        return _Outcome(Verdict.ERROR, message="your code called exit(); return a value instead")
-    if isinstance(error, _BrokenTestError):
-        return _Outcome(Verdict.ERROR, message=f"this test is broken, please tell the course staff{detail}")
-    if frame is None:
-        return _Outcome(Verdict.ERROR, message=f"the test could not use what your code gave it ({name}{detail})")
-    where = f"line {frame.lineno} of {frame.name}" if frame.name != "<module>" else f"line {frame.lineno}"
-    line = "" if hidden or not frame.line else f"\n    {frame.line}"
-    return _Outcome(Verdict.ERROR, message=f"your code raised {name} in {where}{detail}{line}")
+    if isinstance(error, (_BrokenTestError, CannotCrossError)):
+        return Outcome(Verdict.ERROR, message=f"this test is broken, please tell the course staff{detail}")
+    if place is None:
+        return Outcome(Verdict.ERROR, message=f"the test could not use what your code gave it ({name}{detail})")
+    if hidden:
+        return Outcome(Verdict.ERROR, message=f"your code raised {name}")
+    where = f"line {place.line} of {place.function}" if place.function != "<module>" else f"line {place.line}"
+    line = f"\n    {place.text}" if place.text else ""
+    return Outcome(Verdict.ERROR, message=f"your code raised {name} in {where}{detail}{line}")
 
 
-def _last_student_frame(trace: TracebackType | None, namespace: Mapping[str, Any]) -> traceback.FrameSummary | None:
+def builtin_name(error: BaseException) -> str:
+    """The builtin exception that ``error`` is, or ``"an exception"``."""
+    kinds = (kind.__name__ for kind in type(error).__mro__ if getattr(builtins, kind.__name__, None) is kind)
+    name = next(kinds, "Exception")
+    return "an exception" if name in ("Exception", "BaseException") else name
+
+
+def _last_student_place(trace: TracebackType | None, namespace: Mapping[str, Any]) -> Place | None:
     """The innermost frame whose code was defined in the notebook."""
     found = None
     while trace is not None:
         frame = trace.tb_frame
         if frame.f_globals is namespace:
             code, line = frame.f_code, trace.tb_lineno
-            text = linecache.getline(code.co_filename, line, frame.f_globals).strip()
-            found = traceback.FrameSummary(code.co_filename, line, code.co_name, lookup_line=False, line=text)
+            found = Place(code.co_name, line, linecache.getline(code.co_filename, line, frame.f_globals).strip())
         trace = trace.tb_next
     return found
 
 
-def _result(test: Test, suite: Suite, outcome: _Outcome, printed: str, seconds: float) -> TestResult:
+def result_of(test: Test, suite: Suite, outcome: Outcome, printed: str = "", seconds: float = 0.0) -> TestResult:
+    """What a report shows of an outcome; of a hidden test as little as helps."""
     passed = outcome.verdict is Verdict.PASSED
     failure = outcome.failure
     silent = passed or outcome.verdict is Verdict.NOT_WRITTEN  # a hint is for those who tried
     key = "" if silent else (failure.hint if failure and failure.hint else test.hint)
-    message = test.success if passed else outcome.message
+    message = test.success if passed else readable(outcome.message)
     shown: dict[str, str] = {}
     if test.hidden:
         if not passed and outcome.verdict is Verdict.FAILED:
             message = "a hidden test found a mistake"
     elif not passed:
-        shown["printed"] = printed
+        shown["printed"] = readable(printed)
         if failure:
             shown |= {
-                "given": failure.given,
-                "expected": failure.expected,
-                "got": failure.got,
+                "given": readable(failure.given),
+                "expected": readable(failure.expected),
+                "got": readable(failure.got),
                 "misconception": failure.misconception,
             }
     return TestResult(
@@ -185,49 +210,3 @@ def _result(test: Test, suite: Suite, outcome: _Outcome, printed: str, seconds: 
         seconds=seconds,
         **shown,
     )
-
-
-class _BoundedText(io.StringIO):
-    """Keeps the first ``limit`` characters and forgets the rest, so that printing for ever costs no memory."""
-
-    def __init__(self, limit: int) -> None:
-        super().__init__()
-        self._left = limit
-
-    def write(self, text: str) -> int:
-        if self._left > 0:
-            super().write(text[: self._left])
-            self._left -= len(text)
-            if self._left <= 0:
-                super().write("…")
-        return len(text)
-
-
-@contextlib.contextmanager
-def _quiet(output: io.StringIO) -> Iterator[None]:
-    """Keep prints and warnings of the student's code out of the cell: they are no mistakes."""
-    with (
-        contextlib.redirect_stdout(output),
-        contextlib.redirect_stderr(output),
-        warnings.catch_warnings(),
-    ):
-        warnings.simplefilter("ignore")
-        yield
-
-
-@contextlib.contextmanager
-def _seeded(*labels: str) -> Iterator[None]:
-    """Give global random generators a fixed state, so that a check repeats exactly, and put the old one back."""
-    seed = sum(ord(c) * (i + 1) for i, c in enumerate("/".join(labels))) % 2**32
-    numpy = sys.modules.get("numpy")  # not imported here: a lab without numpy stays without
-    python_state = random.getstate()
-    numpy_state = numpy.random.get_state() if numpy else None
-    random.seed(seed)
-    if numpy:
-        numpy.random.seed(seed)
-    try:
-        yield
-    finally:
-        random.setstate(python_state)
-        if numpy:
-            numpy.random.set_state(numpy_state)

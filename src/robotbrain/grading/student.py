@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from robotbrain.grading.expect import CheckFailure
@@ -54,6 +55,31 @@ class Student:
     def uses_reference(self, name: str) -> bool:
         """Whether :meth:`part` gives the reference for ``name``."""
         return name in self._references
+
+    @property
+    def files(self) -> Path:
+        """The folder with the files the student handed in beside the notebook; a test reads them from here."""
+        return Path.cwd()
+
+    def hold(self, value: Any) -> Any:
+        """Return ``value`` to be passed as an argument and looked at afterwards with :meth:`fetch`.
+
+        While grading, arguments are copies on the student's side; a held one stays there, so that a test can see what
+        the student's code changed in it. In the notebook itself it is the value.
+        """
+        return value
+
+    def fetch(self, held: Any) -> Any:
+        """The value of what :meth:`hold` returned, as it is now."""
+        return held
+
+    def run(self, probe: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+        """Call ``probe(student, *args, **kwargs)`` where the student's objects live, and return its answer.
+
+        For what needs the student's process, such as gradients through a student's loss. ``probe`` is a function at
+        module level of a visible suite; it holds inputs at most, never an expected answer, for students can read it.
+        """
+        return probe(self, *args, **kwargs)
 
     def rng(self, label: str = "") -> np.random.Generator:
         """A generator seeded by the suite, ``label`` and the student being graded (``NBGRADER_STUDENT``, if set)."""

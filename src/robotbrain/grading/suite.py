@@ -8,6 +8,8 @@ ships to students; the hidden tests of the same lab live in ``<autograder>/hidde
 from __future__ import annotations
 
 import copy
+import dataclasses
+import enum
 import functools
 import importlib
 import importlib.util
@@ -18,7 +20,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeVar
 
 from robotbrain.errors import InputError
 
@@ -27,6 +29,7 @@ AUTOGRADER_VARIABLE = "ROBOTBRAIN_AUTOGRADER"
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 TestFunction = Callable[[Any], Any]
+Warmer = TypeVar("Warmer", bound=Callable[[], object])
 
 
 @dataclass(frozen=True)
@@ -87,6 +90,8 @@ class Suite:
         self.hints: dict[str, str] = {}
         self.references: dict[str, str | Callable[[], Any]] = {}
         self.bans: dict[str, Ban] = {}
+        self.warmers: list[Callable[[], object]] = []
+        self.crossing: list[type] = []
         self.hidden_by_default = False
 
     @classmethod
@@ -97,6 +102,7 @@ class Suite:
         suite.exercises, suite.tests = dict(visible.exercises), list(visible.tests)
         suite.hints, suite.references = dict(visible.hints), dict(visible.references)
         suite.bans = dict(visible.bans)
+        suite.warmers, suite.crossing = list(visible.warmers), list(visible.crossing)
         suite.hidden_by_default = True
         return suite
 
@@ -156,6 +162,34 @@ class Suite:
         """
         self._known(exercise)
         self.bans[exercise] = Ban(tuple(imports), tuple(allow))
+
+    def warm(self, function: Warmer) -> Warmer:
+        """Register ``function()`` (a decorator) to run once before the first submission of a class.
+
+        Use it to import what is heavy and to fill caches of fixtures and oracles: each submission's tester then starts
+        from a process that has them. Nothing may depend on its having run.
+        """
+        self.warmers.append(function)
+        return function
+
+    def crosses(self, *classes: type) -> None:
+        """Let instances of ``classes`` (dataclasses or enums) come back by value when a student's code returns one.
+
+        Without this a test gets a stand-in that asks the student's process for each attribute. An instance is rebuilt
+        field by field, its ``__post_init__`` included.
+        """
+        for cls in classes:
+            if not isinstance(cls, type) or not (dataclasses.is_dataclass(cls) or issubclass(cls, enum.Enum)):
+                raise self._error("crosses", cls, "a dataclass or an enum", "Name the class, or return plain values.")
+            if cls not in self.crossing:
+                self.crossing.append(cls)
+
+    def ban_of(self, exercise: str) -> Ban:
+        """What an answer to ``exercise`` must not be made of: as declared, the references and the tests themselves."""
+        declared = self.bans.get(exercise, Ban((), ("Lab",)))
+        sources = (self.references.get(name) for name in self._known(exercise).provides)
+        references = (source.replace(":", ".") for source in sources if isinstance(source, str))
+        return Ban((*declared.imports, "robotbrain.grading", *references), declared.allow)
 
     def test(
         self,

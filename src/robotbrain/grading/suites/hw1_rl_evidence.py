@@ -10,19 +10,9 @@ import numpy as np
 
 from robotbrain.grading import expect, expect_close, fail
 
-VERDICTS = {
-    "a": "breaks",
-    "b": "wastes",
-    "c": "wastes",
-    "d": "breaks",
-    "e": "breaks",
-    "f": "breaks",
-    "g": "fine",
-    "h": "breaks",
-    "i": "fine",
-    "j": "breaks",
-}
-"""Of the ten observations about the outline's listing; tests/test_hw1_rl.py tries out those that can be tried."""
+VERDICTS = {"a": "breaks", "b": "wastes", "c": "wastes", "d": "breaks", "e": "breaks"}
+"""Of the first five of the ten observations about the outline's listing; the others are in the hidden tests.
+tests/test_hw1_rl.py tries out those that can be tried."""
 
 _VERDICT_HINTS = {
     "a": "done-means-ended",
@@ -54,23 +44,24 @@ HINTS = {
 Z = 1.96
 
 
-def compare_verdicts(answer: Any, letters: str) -> None:
+def compare_verdicts(answer: Any, key: Mapping[str, str]) -> None:
     """Compare with the key; each letter counts the same."""
     if not isinstance(answer, Mapping):
         fail("VERDICTS should be a dict", got=answer, expected='{"a": "fine", ...}')
     words = ("breaks", "wastes", "fine")
-    unknown = {k: answer[k] for k in letters if k in answer and answer[k] not in words}
+    given = {letter: word if isinstance(word := answer.get(letter), str) else "no answer" for letter in key}
+    unknown = {k: word for k, word in given.items() if k in answer and word not in words}
     expect(not unknown, "that is not one of the three words", got=unknown, expected=words)
-    wrong = [letter for letter in letters if answer.get(letter) != VERDICTS[letter]]
+    wrong = [letter for letter in key if given[letter] != key[letter]]
     if not wrong:
         return
-    right = len(letters) - len(wrong)
+    right = len(key) - len(wrong)
     first = wrong[0]
     fail(
-        f"{right} of {len(letters)} are right; look again at {first!r}",
-        got=f"{first}: {answer.get(first, 'no answer')}",
+        f"{right} of {len(key)} are right; look again at {first!r}",
+        got=f"{first}: {given[first]}",
         hint=_VERDICT_HINTS[first],
-        credit=right / len(letters),
+        credit=right / len(key),
     )
 
 
@@ -98,6 +89,14 @@ def newcombe(sim: Sequence[bool], real: Sequence[bool]) -> tuple[float, float, f
     return p - q, low, high
 
 
+def as_number(answer: Any) -> float:
+    """Return a number as float, anything else as NaN."""
+    try:
+        return float(answer)
+    except (TypeError, ValueError):
+        return math.nan
+
+
 def compare_bound(student: Any, cases: Sequence[tuple[int, int]]) -> None:
     """Compare with the exact bound."""
     from scipy.stats import beta, norm
@@ -105,10 +104,9 @@ def compare_bound(student: Any, cases: Sequence[tuple[int, int]]) -> None:
     for k, n in cases:
         expected = exact_bound(k, n)
         answer = student(k, n)
-        try:
-            given = float(answer)
-        except (TypeError, ValueError):
-            given = math.nan
+        given = as_number(answer)
+        if abs(given - expected) <= 1e-4:
+            continue
         p = k / n
         mistakes = [
             ("one-sided", exact_bound(k, n, 0.025)),
@@ -132,11 +130,13 @@ def compare_gap(student: Any, sim: Sequence[bool], real: Sequence[bool]) -> None
     answer = student(np.array(sim), np.array(real))
     given = f"{sum(sim)} of {len(sim)} in simulation, {sum(real)} of {len(real)} on the surrogate"
     try:
-        values = tuple(float(v) for v in answer)
-    except (TypeError, ValueError):
+        values = tuple(map(as_number, answer))
+    except TypeError:
         values = ()
     if len(values) != 3:
         fail("the answer should be three numbers", got=answer, expected="(difference, low, high)", given=given)
+    if np.allclose(values, expected, rtol=0, atol=1e-4):
+        return
     p, q = sum(sim) / len(sim), sum(real) / len(real)
     (p_low, p_high), (q_low, q_high) = wilson(sum(sim), len(sim)), wilson(sum(real), len(real))
     wald = Z * math.sqrt(p * (1 - p) / len(sim) + q * (1 - q) / len(real))

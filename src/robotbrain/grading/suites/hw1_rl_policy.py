@@ -1,11 +1,12 @@
 """How `hw1_rl` judges a policy file: on targets and arms that its author has not seen, by what its successes prove.
 
 Nothing is trained here, and nothing that a student wrote runs here: the file is data, which `OnnxPolicy` reads and
-checks before ONNX Runtime sees it.
+checks before ONNX Runtime sees it, and arms move in the tests' own process.
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +15,7 @@ import numpy as np
 
 from robotbrain.errors import InputError
 from robotbrain.grading import expect, fail
+from robotbrain.grading.suites import hw1_rl_probes as probes
 from robotbrain.grading.suites.hw1_rl_evidence import exact_bound
 
 if TYPE_CHECKING:
@@ -54,17 +56,17 @@ HINTS = {
 }
 
 
-def load(name: Any) -> OnnxPolicy:
-    """Return the policy in the file ``name`` beside the notebook, or fail and say what it is instead."""
-    from robotbrain.rl.onnx_policy import OnnxPolicy
-
+def load(student: Any, name: Any) -> OnnxPolicy:
+    """Return the policy in the file ``name`` that was handed in, or fail and say what it is instead."""
     if not isinstance(name, str) or Path(name).name != name:
         fail("the name of the policy file should be a plain file name", got=name, expected='"reach_policy.onnx"',
              hint="file-beside-the-notebook")  # fmt: skip
-    if not Path(name).is_file():
+    path = student.files / name
+    if not path.is_file():
         fail(f"there is no file {name} beside the notebook", hint="file-beside-the-notebook")
     try:
-        policy = OnnxPolicy(name)
+        state = path.stat()
+        policy = _opened(path, (state.st_ino, state.st_size, state.st_mtime_ns))
     except InputError as error:
         fail(f"{name} cannot be used: {error.what}", got=error.given, expected=error.expected, hint="not-a-policy")
     meta = policy.meta
@@ -75,17 +77,22 @@ def load(name: Any) -> OnnxPolicy:
     return policy
 
 
-def episodes(
-    policy: OnnxPolicy, serials: Sequence[int], seed: int, *, nominal: bool, repeats: int = 1
-) -> ReachEpisodes:
-    """Let a policy reach targets, ``repeats`` with each arm.
+@functools.lru_cache(maxsize=4)
+def _opened(path: Path, _state: tuple[int, ...]) -> OnnxPolicy:
+    """Return the policy in a file; read, checked and opened once for all tests."""
+    from robotbrain.rl.onnx_policy import OnnxPolicy
+
+    return OnnxPolicy(path)
+
+
+def episodes(policy: OnnxPolicy, serials: Sequence[int], seed: int, *, nominal: bool) -> ReachEpisodes:
+    """Let a policy reach a target with each arm.
 
     Args:
         policy: with metadata.
         serials: of the arms.
         seed: of targets, start poses and sensor noise.
         nominal: in simulation, where every arm is as the model says.
-        repeats: targets per arm.
     """
     from robotbrain.rl.surrogate import SurrogateReachEnv, neutral
 
@@ -94,39 +101,66 @@ def episodes(
     else:
         env = SurrogateReachEnv(serials, seed)
     try:
-        return env.run(policy, repeats)
+        return env.run(policy)
     except InputError as error:
         fail(f"this policy cannot run the arm: {error.what}", got=error.given, expected=error.expected,
              hint="another-robot")  # fmt: skip
         raise  # for the type checker: fail always raises
 
 
-def judge(name: Any, serials: Sequence[int], seed: int, *, nominal: bool, threshold: float, repeats: int = 1) -> None:
+PRACTICE_IN_SIMULATION = ((15, 0.10), (40, 0.05), (100, 0.05))
+PRACTICE_ON_SURROGATES = ((11, 0.10), (40, 0.05), (100, 0.05))
+FINAL_IN_SIMULATION = ((20, 0.04), (60, 0.01), (300, 0.05))
+FINAL_ON_SURROGATES = ((15, 0.04), (60, 0.01), (300, 0.05))
+"""After how many targets to look, and with how much doubt the wanted rate may then be thought to be proved. A policy
+that reaches nearly all of them needs few: all of the first look's settle it."""
+
+
+def judge(
+    student: Any,
+    name: Any,
+    serials: Sequence[int],
+    seed: int,
+    *,
+    nominal: bool,
+    threshold: float,
+    looks: Sequence[tuple[int, float]],
+) -> None:
     """Fail unless the successes prove a rate of at least ``threshold``; half of the points for ``HALF``.
 
     Args:
+        student: whose files they are.
         name: of the file.
-        serials, seed, nominal, repeats: as in :func:`episodes`.
-        threshold: for the lower end of the exact one-sided 95 % interval.
+        serials, seed, nominal: as in :func:`episodes`.
+        threshold: for the lower end of the exact one-sided interval.
+        looks: after how many serials to look, and how much doubt the interval then leaves. A policy that cannot come
+            to half of the points any more is not looked at any further.
     """
-    policy = load(name)
-    run = episodes(policy, serials, seed, nominal=nominal, repeats=repeats)
-    reached, n = int(run.success.sum()), len(run.success)
-    bound = exact_bound(reached, n)
+    policy = load(student, name)
+    errors, reached, n = [], 0, 0
+    for number, (count, doubt) in enumerate(looks):
+        run = episodes(policy, serials[n:count], seed + number, nominal=nominal)
+        errors.append(run.final_error)
+        reached, n = reached + int(run.success.sum()), count
+        if exact_bound(reached, n, doubt) >= threshold:
+            return
+        if 1 - exact_bound(n - reached, n, 0.001) < HALF:  # the rate is less than this
+            break
+    bound, error = exact_bound(reached, n), np.concatenate(errors)
     place = "in simulation" if nominal else "on surrogate arms"
     expect(
         bound >= threshold,
         f"too few targets are reached {place}",
         given=f"{n} targets; reached is within 2 cm over the last 5 of 50 steps",
         got=f"{reached} of {n} reached, which proves at least {bound:.1%}; mean distance at the end "
-        f"{100 * float(np.mean(run.final_error)):.1f} cm",
+        f"{100 * float(np.mean(error)):.1f} cm",
         expected=f"a proved rate of at least {threshold:.0%}",
-        hint=_why(policy, run, nominal),
+        hint=_why(policy, error, nominal),
         credit=0.5 if bound >= HALF else 0.0,
     )
 
 
-def _why(policy: OnnxPolicy, run: ReachEpisodes, nominal: bool) -> str:
+def _why(policy: OnnxPolicy, error: Any, nominal: bool) -> str:
     """Return the hint for a policy that reaches too little."""
     names = [f"joint{k}" for k in range(1, 8)]
     if list(policy.meta.joint_names) != names:
@@ -134,39 +168,141 @@ def _why(policy: OnnxPolicy, run: ReachEpisodes, nominal: bool) -> str:
     scale = np.asarray(policy.meta.action_scale)
     if policy.meta.action_kind != "held_relative_joint_position" or not np.allclose(scale, ACTION_SCALE):
         return "actions-in-the-meta"
-    if float(np.median(run.final_error)) > 0.15:
+    if float(np.median(error)) > 0.15:
         return "untrained-policy"
     return "train-on" if nominal else "differs-from-training"
 
 
-def compare_randomised(randomise: Any, arms: int = 8, steps: int = 12) -> None:
-    """With the student's events, arms that begin alike and are commanded alike end up apart; the interface stays."""
+# ---------------------------------------------------------------- arms that differ
+
+
+def compare_randomised(student: Any, rng: np.random.Generator, arms: int = 5, steps: int = 6) -> None:
+    """With the student's events, arms that begin alike and are commanded alike end up apart; the interface stays.
+
+    The configuration comes as plain values; the arms that it describes are made and moved here.
+    """
+    found = student.run(probes.randomised)
+    _check_interface(found["cfg"])
+    try:
+        spread = _spread(_with_events(found["events"]), arms, steps, seed=int(rng.integers(2**31)))
+    except InputError as error:
+        fail(f"these events cannot be used: {error.what}", got=error.given, expected=error.expected, hint="arms-differ")
+        raise  # for the type checker: fail always raises
+    # Without events the arms move alike to the last bit.
+    expect(spread > 1e-3, "all arms still move alike",
+           given=f"{arms} arms from the same pose, the same {steps} actions",
+           got=f"their joint angles differ by {spread:.2g} rad", expected="more than 0.001 rad",
+           hint="arms-differ")  # fmt: skip
+
+
+def _spread(cfg: Any, arms: int, steps: int, seed: int) -> float:
+    """Return the standard deviation of the joint angles (rad) that the arms come to, of the joint where it is most."""
     import torch
 
     from robotbrain.rl.envs import ManagerBasedRLEnv
+
+    cfg.scene.num_envs, cfg.seed = arms, seed
+    env = ManagerBasedRLEnv(cfg, num_threads=1)
+    env.reset(seed=seed)
+    robot = env.scene["robot"]
+    start = robot.data.default_joint_pos.torch
+    robot.write_joint_state_to_sim(start, torch.zeros_like(start))
+    action = torch.zeros(arms, env.num_actions)
+    for k in range(steps):
+        action[:] = 0.5 if k < steps // 2 else -0.5
+        env.step(action)
+    return float(robot.data.joint_pos.torch.std(dim=0).max())
+
+
+@functools.cache
+def _plain_task() -> Any:
     from robotbrain.rl.gap_variants import reach_cfg
 
-    spreads = []
-    for change in (lambda cfg: cfg, randomise):
-        cfg = reach_cfg()
-        changed = change(cfg)
-        cfg = cfg if changed is None else changed
-        cfg.scene.num_envs, cfg.seed = arms, 3
-        env = ManagerBasedRLEnv(cfg, num_threads=1)
-        obs, _ = env.reset(seed=3)
-        seen = obs["policy"]
-        sizes = (seen.shape[1] if isinstance(seen, torch.Tensor) else 0, env.num_actions)
-        expect(sizes == (34, 7), "the robot's interface changed", got=f"observations and actions: {sizes}",
-               expected=(34, 7), hint="same-robot")  # fmt: skip
-        robot = env.scene["robot"]
-        start = robot.data.default_joint_pos.torch
-        robot.write_joint_state_to_sim(start, torch.zeros_like(start))
-        action = torch.zeros(arms, 7)
-        for k in range(steps):
-            action[:] = 0.5 if k < steps // 2 else -0.5
-            env.step(action)
-        spreads.append(float(robot.data.joint_pos.torch.std(dim=0).max()))
-    expect(spreads[1] > max(1e-3, 10 * spreads[0]), "all arms still move alike",
-           given=f"{arms} arms from the same pose, the same {steps} actions",
-           got=f"their joint angles differ by {spreads[1]:.2g} rad", expected="more than 0.001 rad",
-           hint="arms-differ")  # fmt: skip
+    return reach_cfg()
+
+
+def _check_interface(answer: Any) -> None:
+    """Fail where more than events and noise differs from the task that was given."""
+    given = _plain_task().to_dict()
+    for part, wanted in given.items():
+        if part in ("events", "seed"):
+            continue
+        got = answer[part]
+        if part == "observations":
+            got, wanted = (_without_noise(value) for value in (got, wanted))
+        differs = _difference(got, wanted, part)
+        expect(not differs, "the robot's interface changed", got=f"another {differs}", expected="as it was given",
+               hint="same-robot")  # fmt: skip
+
+
+def _without_noise(observations: Any) -> dict[str, Any]:
+    """Return a copy of the observation groups without their terms' noise."""
+    return {
+        group: {
+            name: {key: v for key, v in term.items() if key != "noise"} if isinstance(term, dict) else term
+            for name, term in terms.items()
+            if name != "enable_corruption"
+        }
+        for group, terms in observations.items()
+    }
+
+
+def _difference(got: Any, wanted: Any, where: str) -> str:
+    """Return the path to the first value that differs, or ''."""
+    if isinstance(wanted, dict):
+        if not isinstance(got, dict):
+            return where
+        if got.keys() != wanted.keys():
+            return f"{where}: {', '.join(sorted(map(str, got.keys() ^ wanted.keys())))}"
+        return next(filter(None, (_difference(got[k], wanted[k], f"{where}.{k}") for k in wanted)), "")
+    if isinstance(wanted, (list, tuple)):
+        got, wanted = (list(v) if isinstance(v, (list, tuple)) else v for v in (got, wanted))
+    return "" if type(got) is type(wanted) and got == wanted else where
+
+
+_EVENTS = ("apply_", "push_", "randomize_", "reset_")
+"""How the names of events in robotbrain.rl.mdp begin."""
+
+
+def _with_events(answer: Any) -> Any:
+    """Return the plain task with the events that the student described."""
+    from robotbrain.rl import mdp
+    from robotbrain.rl.gap_variants import reach_cfg
+    from robotbrain.rl.managers import EventTermCfg
+
+    cfg = reach_cfg()
+    for name in vars(cfg.events):
+        setattr(cfg.events, name, None)
+    for name, term in answer.items():
+        module, _, function = str(term["func"]).partition(":")
+        known = module.startswith(f"{mdp.__name__}.") and function.startswith(_EVENTS) and hasattr(mdp, function)
+        expect(known, f"the event {name!r} is not one of robotbrain.rl.mdp", got=term["func"],
+               expected="e.g. mdp.randomize_motor_strength", hint="arms-differ")  # fmt: skip
+        fields = {key: value for key, value in term.items() if key not in ("func", "params")}
+        params = {key: _entity(value) for key, value in term["params"].items()}
+        setattr(cfg.events, str(name), EventTermCfg(func=getattr(mdp, function), params=params, **fields))
+    return cfg
+
+
+def _entity(value: Any) -> Any:
+    """Return an event's parameter; a selection of joints or bodies as the configuration that it was."""
+    from robotbrain.rl.managers import SceneEntityCfg
+
+    if not isinstance(value, dict) or "joint_names" not in value:
+        return value
+    everything = str(slice(None))
+    chosen = {key: v for key, v in value.items() if not (key in ("joint_ids", "body_ids") and v == everything)}
+    return SceneEntityCfg(**chosen)
+
+
+def warm() -> None:
+    """Import, compile and cache what judging needs."""
+    from scipy import stats
+
+    from robotbrain.rl.onnx_policy import OnnxPolicy  # noqa: F401
+    from robotbrain.rl.surrogate import SurrogateReachEnv, neutral
+
+    stats.beta.ppf(0.05, 3, 4)
+    for params in (None, [neutral(7)]):
+        SurrogateReachEnv([0], 0, params=params).reset()
+    _spread(_with_events(probes.events_of(_plain_task())), 2, 1, seed=0)

@@ -1,4 +1,4 @@
-"""What the tests of `hw1_rl` share: small networks, a control problem with a closed form, and our own answers.
+"""What the tests of `hw1_rl` share: a control problem with a closed form, and our own answers.
 
 The answers (``td_target`` and its kin) stand in for a part of the student's that is not right yet, so that what builds
 on it can still be graded; they are also what the student's parts are compared with.
@@ -6,19 +6,19 @@ on it can still be graded; they are also what the student's parts are compared w
 
 from __future__ import annotations
 
-import contextlib
 import copy
-import random
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from robotbrain.grading import expect, fail
+from robotbrain.grading.suites.hw1_rl_probes import Batch
 
 torch.optim.Adam([torch.zeros(1, requires_grad=True)])  # the first optimiser loads for seconds: now, not in a check
 
@@ -26,31 +26,6 @@ Array = NDArray[np.float64]
 
 FALSE_ALARM = 1e-6
 """How often a test of random numbers may fail an answer that is right, if its generator cannot be seeded from here."""
-
-
-class Batch(NamedTuple):
-    """Transitions, batch first: (B, O), (B, A), (B,), (B, O), (B,), float32."""
-
-    obs: Tensor
-    action: Tensor
-    reward: Tensor
-    next_obs: Tensor
-    terminated: Tensor
-
-
-@contextlib.contextmanager
-def seeded(seed: int) -> Iterator[None]:
-    """Seed every global generator that a student may draw from, and put their states back."""
-    python, numbers = random.getstate(), np.random.get_state()  # noqa: NPY002 - a student may use it
-    with torch.random.fork_rng(devices=[]):
-        random.seed(seed)
-        np.random.seed(seed)  # noqa: NPY002
-        torch.manual_seed(seed)
-        try:
-            yield
-        finally:
-            random.setstate(python)
-            np.random.set_state(numbers)  # noqa: NPY002
 
 
 def torch_rng(rng: np.random.Generator) -> torch.Generator:
@@ -69,14 +44,14 @@ def as_tensor(
         hints: (wrong shape, key of the hint) pairs.
     """
     if not isinstance(answer, Tensor):
-        fail(f"{what} should be a torch tensor, but is of type {type(answer).__name__}", got=answer,
+        fail(f"{what} should be a torch tensor", got=answer,
              expected=f"a tensor of shape {shape}")  # fmt: skip
     if tuple(answer.shape) != shape:
         hint = next((key for wrong, key in hints if tuple(answer.shape) == wrong), "shape-of-a-batch")
         fail(f"{what} has shape {tuple(answer.shape)}, but shape {shape} is expected", got=tuple(answer.shape),
              expected=shape, hint=hint)  # fmt: skip
     expect(answer.dtype.is_floating_point, f"{what} should hold floating-point numbers", got=str(answer.dtype))
-    tensor: Tensor = answer
+    tensor: Tensor = answer.detach()
     return tensor
 
 
@@ -90,66 +65,7 @@ def first_match(answer: Tensor, mistakes: Sequence[tuple[str, Tensor]], expected
     return ""
 
 
-# ---------------------------------------------------------------- small networks
-
-
-class SmallActor(nn.Module):
-    """A smooth policy into (-1, 1): a finite difference of it is as good as a derivative."""
-
-    def __init__(self, obs_dim: int, act_dim: int, hidden: int = 8, generator: torch.Generator | None = None) -> None:
-        super().__init__()
-        self.layers = nn.Sequential(nn.Linear(obs_dim, hidden), nn.Tanh(), nn.Linear(hidden, act_dim), nn.Tanh())
-        randomise(self, generator)
-
-    def forward(self, obs: Tensor) -> Tensor:
-        """Return the actions (B, A)."""
-        return self.layers(obs)  # type: ignore[no-any-return]
-
-
-class SmallCritic(nn.Module):
-    """A smooth value of (obs, action), (B, 1) as the homework's own."""
-
-    def __init__(self, obs_dim: int, act_dim: int, hidden: int = 8, generator: torch.Generator | None = None) -> None:
-        super().__init__()
-        self.layers = nn.Sequential(nn.Linear(obs_dim + act_dim, hidden), nn.Tanh(), nn.Linear(hidden, 1))
-        randomise(self, generator)
-
-    def forward(self, obs: Tensor, action: Tensor) -> Tensor:
-        """Return the values (B, 1)."""
-        return self.layers(torch.cat([obs, action], dim=-1))  # type: ignore[no-any-return]
-
-
-@torch.no_grad()
-def randomise(network: nn.Module, generator: torch.Generator | None, spread: float = 0.6) -> None:
-    """Draw all parameters anew, N(0, spread^2)."""
-    if generator is not None:
-        for parameter in network.parameters():
-            parameter.copy_(spread * torch.randn(parameter.shape, generator=generator))
-
-
-class LinearActor(nn.Module):
-    """The policy ``u = -K x``; ``gain`` is K (A, O)."""
-
-    def __init__(self, gain: Any) -> None:
-        super().__init__()
-        self.gain = nn.Parameter(torch.as_tensor(np.asarray(gain), dtype=torch.float32).clone())
-
-    def forward(self, obs: Tensor) -> Tensor:
-        """Return the actions (B, A)."""
-        return -obs @ self.gain.T
-
-
-class QuadraticCritic(nn.Module):
-    """The value ``-z' H z`` of ``z = (x, u)``; H (O + A, O + A), of which only the symmetric part matters."""
-
-    def __init__(self, hessian: Any) -> None:
-        super().__init__()
-        self.hessian = nn.Parameter(torch.as_tensor(np.asarray(hessian), dtype=torch.float32).clone())
-
-    def forward(self, obs: Tensor, action: Tensor) -> Tensor:
-        """Return the values (B, 1)."""
-        z = torch.cat([obs, action], dim=-1)
-        return -((z @ self.hessian) * z).sum(dim=-1, keepdim=True)
+# ---------------------------------------------------------------- a problem with a closed form
 
 
 @dataclass(frozen=True)
@@ -165,7 +81,7 @@ class LinearQuadratic:
     r: Array
     gamma: float
 
-    @property
+    @cached_property
     def cost_to_go(self) -> Array:
         """P: the optimal value of x is ``-x' P x``."""
         from scipy.linalg import solve_discrete_are
@@ -173,7 +89,7 @@ class LinearQuadratic:
         root = np.sqrt(self.gamma)
         return np.asarray(solve_discrete_are(root * self.a, root * self.b, self.s, self.r))
 
-    @property
+    @cached_property
     def gain(self) -> Array:
         """K: the optimal action is ``-K x``."""
         p = self.cost_to_go
@@ -181,7 +97,7 @@ class LinearQuadratic:
             np.linalg.solve(self.r + self.gamma * self.b.T @ p @ self.b, self.gamma * self.b.T @ p @ self.a)
         )
 
-    @property
+    @cached_property
     def hessian(self) -> Array:
         """H: the optimal Q of z = (x, u) is ``-z' H z``."""
         ab = np.hstack([self.a, self.b])
@@ -324,41 +240,3 @@ class Agent:
     def _follow(self) -> None:
         for name in self.steps.follow:
             soft_update(getattr(self, f"{name}_target"), getattr(self, name), self.tau)
-
-
-# ---------------------------------------------------------------- derivatives
-
-
-def finite_differences(value: Callable[[], float], network: nn.Module, step: float = 1e-2) -> list[Tensor]:
-    """Return the central differences of a smooth ``value()`` by every parameter of ``network``.
-
-    In float32 the step that makes rounding and curvature equally small is about 0.01; both are then below 1e-3.
-    """
-    gradients = []
-    for parameter in network.parameters():
-        flat = parameter.data.view(-1)
-        gradient = torch.empty_like(flat)
-        for k in range(flat.numel()):
-            kept = float(flat[k])
-            flat[k] = kept + step
-            above = value()
-            flat[k] = kept - step
-            gradient[k] = (above - value()) / (2 * step)
-            flat[k] = kept
-        gradients.append(gradient.view_as(parameter))
-    return gradients
-
-
-def gradients_of(loss: Any, network: nn.Module, what: str, hint: str = "") -> list[Tensor]:
-    """Return what ``loss.backward()`` leaves in the parameters of ``network``; fail where there is no way back."""
-    as_tensor(loss, what, ())
-    expect(
-        loss.requires_grad,
-        f"{what} is cut off from the network: nothing can be learned from it",
-        hint=hint,
-        misconception="somewhere between the network and the loss stands detach(), no_grad(), item() or numpy()",
-    )
-    for parameter in network.parameters():
-        parameter.grad = None
-    loss.backward()
-    return [torch.zeros_like(p) if p.grad is None else p.grad.clone() for p in network.parameters()]

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from robotbrain.grading import expect, expect_close, fail
+from robotbrain.grading.suites import hw2_optimisation_probes as probes
 from robotbrain.grading.suites import hw2_optimisation_tools as tools
 
 HINTS = {
@@ -79,9 +79,9 @@ HINTS = {
 
 def compare_mask(student: Any, weight: Tensor, sparsity: float, given: str) -> None:
     """The mask keeps exactly the right number of weights, and none that is smaller than one that goes."""
-    kept_before = weight.clone()
-    mask = _mask(student(weight, sparsity), weight, given)
-    expect(torch.equal(weight, kept_before), "the weights were changed: only a mask was asked for", given=given)
+    held = student.hold(weight.clone())
+    mask = _mask(student.magnitude_mask(held, sparsity), weight, given)
+    expect(torch.equal(student.fetch(held), weight), "the weights were changed: only a mask was asked for", given=given)
     size = weight.numel()
     drop = round(sparsity * size)
     zeros = int((~mask).sum())
@@ -123,7 +123,7 @@ def _mask(answer: Any, weight: Tensor, given: str) -> Tensor:
 
 def compare_two_four(student: Any, weight: Tensor, given: str) -> None:
     """Of four neighbours along the input channels exactly two stay, the larger ones."""
-    mask = _mask(student(weight), weight, given)
+    mask = _mask(student.two_four_mask(weight.clone()), weight, given)
 
     def groups(tensor: Tensor) -> Tensor:
         moved = tensor.movedim(1, -1)
@@ -152,39 +152,19 @@ def compare_two_four(student: Any, weight: Tensor, given: str) -> None:
 # ---------------------------------------------------------------- pruning
 
 
-class Mixed(nn.Module):
-    """Convolutions with and without bias, batch norms, a linear layer: what to prune, and what to leave alone."""
-
-    def __init__(self, seed: int) -> None:
-        super().__init__()
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
-            self.body = nn.Sequential(
-                nn.Conv2d(3, 8, 3, bias=False), nn.BatchNorm2d(8), nn.ReLU(), nn.Conv2d(8, 12, 1), nn.ReLU()
-            )
-            self.head = nn.Linear(12, 5)
-            with torch.no_grad():
-                self.body[3].weight.mul_(0.1)  # type: ignore[operator]  # layers of different sizes of weights
-                self.body[1].weight.uniform_(0.5, 1.5)  # type: ignore[operator]
-
-    def forward(self, image: Tensor) -> Tensor:
-        """Return (N, 5) for (N, 3, H, W)."""
-        return self.head(self.body(image).mean(dim=(2, 3)))  # type: ignore[no-any-return]
-
-
-def compare_pruned(student: Any, sparsity: float, seed: int) -> None:
+def compare_pruned(student: Any, sparsity: float, rng: np.random.Generator) -> None:
     """After ``prune`` each weight tensor has its own share of zeros, and nothing else has changed."""
-    network = Mixed(seed)
-    before, leaves = tools.state_of(network), dict(network.named_parameters())
-    wanted = list(tools.prunable(network))
+    network = tools.mixed_network(rng)
+    before, names = probes.state_of(network), [name for name, _ in network.named_parameters()]
+    wanted = list(probes.prunable(network))
     given = f"a network with convolutions, a batch norm and a linear layer; sparsity = {sparsity:g}"
-    masks = student(network, sparsity)
-    now = dict(network.named_parameters())
-    expect(list(now) == list(leaves) and all(now[n] is leaves[n] for n in leaves), "parameters were replaced",
-           got=list(now), expected=list(leaves), given=given, hint="parameters-stay")  # fmt: skip
+    found = student.run(probes.pruned, before, sparsity)
+    masks, now = found["answer"], found["state"]
+    expect(found["names"] == names and found["kept"] is True, "parameters were replaced",
+           got=found["names"], expected=names, given=given, hint="parameters-stay")  # fmt: skip
     if not isinstance(masks, Mapping):
         fail("the answer should be a dict of masks", got=masks, expected='{"body.0.weight": mask, ...}', given=given)
-    others = [n for n in (*masks, *tools.changed(before, network)) if n not in wanted]
+    others = [n for n in (*masks, *tools.changed(before, now)) if n not in wanted]
     expect(not others, "other numbers than the weights of convolutions and linear layers are pruned", got=others,
            expected=wanted, given=given, hint="weights-only")  # fmt: skip
     missing = [n for n in wanted if n not in masks]
@@ -208,99 +188,72 @@ def compare_pruned(student: Any, sparsity: float, seed: int) -> None:
                given=given, hint="small-ones-go")  # fmt: skip
 
 
-def compare_pruned_steps(student: Any, seed: int, steps: int = 4) -> None:
+def compare_pruned_steps(student: Any, rng: np.random.Generator, kind: str, steps: int = 4) -> None:
     """Zeros stay zeros while the rest learns, also with an optimiser that remembers dense gradients."""
-    for make in (_adam, _momentum):
-        network = Mixed(seed)
-        optimiser = make(network)
-        generator = torch.Generator().manual_seed(seed)
-        images, wanted = torch.randn(12, 3, 5, 5, generator=generator), torch.randn(12, 5, generator=generator)
+    network = tools.mixed_network(rng)
+    state = probes.state_of(network)
+    images, wanted = (
+        torch.from_numpy(rng.normal(0, 1, shape).astype(np.float32)) for shape in ((12, 3, 5, 5), (12, 5))
+    )
+    masks = {name: tools.magnitude_mask(weight, 0.5) for name, weight in probes.prunable(network).items()}
+    given = f"{kind} after three dense steps, then {steps} steps with half of the weights pruned"
 
-        def loss_of(net: nn.Module, images: Tensor = images, wanted: Tensor = wanted) -> Tensor:
-            return functional.mse_loss(net(images), wanted)
+    def after(mistake: str, step: int) -> Tensor:
+        return _run_steps(state, kind, masks, images, wanted, mistake, step)
 
-        for _ in range(3):  # the dense training before
-            optimiser.zero_grad()
-            loss_of(network).backward()  # type: ignore[no-untyped-call]
-            optimiser.step()
-        optimiser.zero_grad()
-        masks = {}
-        with torch.no_grad():
-            for name, weight in tools.prunable(network).items():
-                masks[name] = tools.magnitude_mask(weight, 0.5)
-                weight.mul_(masks[name])
-        runs = {key: _run_steps(network, optimiser, masks, loss_of, make, key, steps) for key in ("", *_STEP_MISTAKES)}
-        given = (
-            f"{type(optimiser).__name__} after three dense steps, then {steps} steps with half of the weights pruned"
-        )
-        for _ in range(steps):
-            student(network, masks, optimiser, loss_of(network))
-            back = {n: int((w[~masks[n]] != 0).sum()) for n, w in tools.prunable(network).items()}
-            if any(back.values()):
-                key = tools.first_match(tools.flat(network), _after(runs, after=1), runs[""][0])
-                fail("pruned weights came back", got=f"{sum(back.values())} pruned weights are not zero",
-                     expected="every pruned weight is 0 after every step", given=given,
-                     hint=key or "mask-after-the-step")  # fmt: skip
-        got, right = tools.flat(network), runs[""][-1]
-        hint = tools.first_match(got, _after(runs, after=steps), right) or "kept-weights-learn"
-        expect_close(got.numpy(), right.numpy(), rtol=1e-3, atol=1e-5, given=given, hint=hint,
-                     what="the network after the steps")  # fmt: skip
+    found = student.run(probes.pruned_steps, state, kind, masks, images, wanted, steps)
+    for k in range(steps):
+        back = {name: int((found[k][name][~mask] != 0).sum()) for name, mask in masks.items()}
+        if any(back.values()):
+            wrong = [(key, after(key, k + 1)) for key in _STEP_MISTAKES]
+            key = tools.first_match(tools.flat(found[k]), wrong, after("", k + 1))
+            fail("pruned weights came back", got=f"{sum(back.values())} pruned weights are not zero",
+                 expected="every pruned weight is 0 after every step", given=given,
+                 hint=key or "mask-after-the-step")  # fmt: skip
+    got, right = tools.flat(found[steps - 1]), after("", steps)
+    hint = tools.first_match(got, lambda: [(key, after(key, steps)) for key in _STEP_MISTAKES], right)
+    expect_close(got.numpy(), right.numpy(), rtol=1e-3, atol=1e-5, given=given, hint=hint or "kept-weights-learn",
+                 what="the network after the steps")  # fmt: skip
 
 
 _STEP_MISTAKES = ("mask-after-the-step", "momentum-remembers", "zero-grad")
 
 
-def _after(runs: Mapping[str, list[Tensor]], after: int) -> list[tuple[str, Any]]:
-    return [(key, runs[key][after - 1]) for key in _STEP_MISTAKES]
-
-
-def _adam(network: nn.Module) -> torch.optim.Optimizer:
-    return torch.optim.Adam(network.parameters(), lr=1e-2)
-
-
-def _momentum(network: nn.Module) -> torch.optim.Optimizer:
-    return torch.optim.SGD(network.parameters(), lr=1e-2, momentum=0.9)
-
-
 def _run_steps(
-    network: nn.Module,
-    optimiser: torch.optim.Optimizer,
+    state: Mapping[str, Tensor],
+    kind: str,
     masks: Mapping[str, Tensor],
-    loss_of: Callable[[nn.Module], Tensor],
-    make: Callable[[nn.Module], torch.optim.Optimizer],
+    images: Tensor,
+    wanted: Tensor,
     mistake: str,
     steps: int,
-) -> list[Tensor]:
-    """Return the network's numbers after each step, made right or with a mistake, on a copy."""
-    net = copy.deepcopy(network)
-    own = make(net)
-    own.load_state_dict(copy.deepcopy(optimiser.state_dict()))
-    found = []
+) -> Tensor:
+    """Return a pruned network's numbers after some steps, made right or with a mistake."""
+    network, optimiser = probes.trained(state, kind, images, wanted)
+    probes.apply_masks(network, masks)
     for _ in range(steps):
-        loss = loss_of(net)
+        loss = probes.loss_of(network, images, wanted)
         if mistake != "zero-grad":
-            own.zero_grad()
+            optimiser.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
-        weights = tools.prunable(net)
         if mistake == "momentum-remembers":
-            for name, weight in weights.items():
+            for name, weight in probes.prunable(network).items():
                 assert weight.grad is not None
                 weight.grad.mul_(masks[name])
-        own.step()
+        optimiser.step()
         if mistake not in ("mask-after-the-step", "momentum-remembers"):
-            with torch.no_grad():
-                for name, weight in weights.items():
-                    weight.mul_(masks[name])
-        found.append(tools.flat(net))
-    return found
+            probes.apply_masks(network, masks)
+    return tools.flat(probes.state_of(network))
 
 
 # ---------------------------------------------------------------- the distillation loss
 
 
-def logits_and_labels(seed: int, shape: tuple[int, ...] = (3, 4, 2, 5), unknown: float = 0.0) -> tuple[Tensor, ...]:
+def logits_and_labels(
+    rng: np.random.Generator, shape: tuple[int, ...] = (3, 4, 2, 5), unknown: float = 0.0
+) -> tuple[Tensor, ...]:
     """Return logits of student and teacher, float64, and labels, a share ``unknown`` of them 255."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
     student = 2 * torch.randn(shape, generator=generator, dtype=torch.float64)
     teacher = 3 * torch.randn(shape, generator=generator, dtype=torch.float64)
     labels = torch.randint(0, shape[1], (shape[0], *shape[2:]), generator=generator)
@@ -314,17 +267,14 @@ def compare_loss(
     """Compare the value with alpha T^2 KL(teacher || student) + (1 - alpha) CE."""
     z, t, labels = logits
     expected = tools.distillation_loss(z, t, labels, temperature, alpha)
-    leaf = z.clone().requires_grad_(True)
-    answer = student(leaf, t.clone(), labels.clone(), temperature=temperature, alpha=alpha)
-    connected = tools.as_tensor(answer, "the loss", (), "mean-over-pixels", "loss-has-a-gradient")
-    loss = connected.detach()
-    hint = tools.first_match(loss, _loss_mistakes(z, t, labels, temperature, alpha), expected)
+    found = student.run(probes.distilled, z, t, labels, temperature, alpha)
+    loss = tools.as_tensor(found["loss"], "the loss", (), "mean-over-pixels", "loss-has-a-gradient")
+    hint = tools.first_match(loss, lambda: _loss_mistakes(z, t, labels, temperature, alpha), expected)
     if bool(torch.isnan(loss)) and bool((labels == tools.IGNORE).all()):
         hint = "mean-of-nothing"
     expect_close(loss.numpy(), expected.numpy(), rtol=rtol, atol=1e-9, given=given, hint=hint, what="the loss")
-    if connected.requires_grad:  # a NaN that was replaced in the value comes back in the gradient
-        connected.backward()  # type: ignore[no-untyped-call]
-        finite = leaf.grad is None or bool(torch.isfinite(leaf.grad).all())
+    if found["gradient"] is not None:  # a NaN that was replaced in the value comes back in the gradient
+        finite = bool(torch.isfinite(found["gradient"]).all())
         expect(finite, "the loss is finite, but its gradient is not", given=given, hint="mean-of-nothing")
 
 
@@ -397,51 +347,44 @@ def _loss_mistakes(z: Tensor, t: Tensor, labels: Tensor, temp: float, alpha: flo
     return found
 
 
-def compare_loss_gradient(student: Any, seed: int) -> None:
-    """The gradient is the derivative (central differences); none reaches the teacher."""
-    z, t, labels = logits_and_labels(seed, (2, 4, 1, 3))
-    z, t = z.requires_grad_(True), t.requires_grad_(True)
-    answer = student(z, t, labels, temperature=3.0, alpha=0.6)
-    loss = tools.as_tensor(answer, "the loss", (), "mean-over-pixels", "loss-has-a-gradient")
-    expect(loss.requires_grad, "the loss is cut off from the student: nothing can be learned from it",
+def _gradient(found: Mapping[str, Any], logits: Tensor) -> Tensor:
+    """Return the gradient by the student's logits, or fail where there is none."""
+    tools.as_tensor(found["loss"], "the loss", (), "mean-over-pixels", "loss-has-a-gradient")
+    expect(found["connected"] is True, "the loss is cut off from the student: nothing can be learned from it",
            hint="loss-has-a-gradient")  # fmt: skip
-    loss.backward()  # type: ignore[no-untyped-call]
-    expect(z.grad is not None, "no gradient reaches the student's logits", hint="loss-has-a-gradient")
-    expect(t.grad is None or not bool(t.grad.any()), "a gradient reaches the teacher's logits", got=t.grad,
+    expect(found["gradient"] is not None, "no gradient reaches the student's logits", hint="loss-has-a-gradient")
+    return tools.as_tensor(found["gradient"], "the gradient", tuple(logits.shape), "loss-has-a-gradient")
+
+
+def compare_loss_gradient(student: Any, rng: np.random.Generator) -> None:
+    """The gradient is the derivative; none reaches the teacher."""
+    z, t, labels = logits_and_labels(rng, (2, 4, 1, 3))
+    temperature, alpha = float(rng.uniform(2.5, 3.5)), float(rng.uniform(0.55, 0.65))
+    found = student.run(probes.distilled, z, t, labels, temperature, alpha, teacher_learns=True)
+    got, teacher = _gradient(found, z), found["teacher"]
+    expect(teacher is None or not bool(teacher.any()), "a gradient reaches the teacher's logits", got=teacher,
            expected="none", hint="teacher-is-a-constant")  # fmt: skip
-    with torch.no_grad():
-        probe = z.detach().clone()
-        slope = torch.zeros_like(probe)
-        for k in range(probe.numel()):
-            for sign in (1, -1):
-                probe.view(-1)[k] += sign * 1e-5
-                slope.view(-1)[k] += sign * float(tools.distillation_loss(probe, t, labels, 3.0, 0.6)) / 2e-5
-                probe.view(-1)[k] -= sign * 1e-5
-    assert z.grad is not None
-    expect_close(z.grad.numpy(), slope.numpy(), rtol=1e-3, atol=1e-6, what="the gradient by the student's logits",
-                 hint=_gradient_hint(z, t, labels, z.grad, slope))  # fmt: skip
+    leaf = z.clone().requires_grad_(True)
+    (slope,) = torch.autograd.grad(tools.distillation_loss(leaf, t, labels, temperature, alpha), leaf)
+
+    def mistakes() -> tools.Mistakes:
+        wrong = _loss_mistakes(leaf, t, labels, temperature, alpha)
+        return [
+            (key, torch.autograd.grad(value, leaf, retain_graph=True)[0]) for key, value in wrong if value.requires_grad
+        ]
+
+    hint = tools.first_match(got, mistakes, slope) or ("" if bool(got.any()) else "loss-has-a-gradient")
+    expect_close(got.numpy(), slope.numpy(), rtol=1e-3, atol=1e-6, what="the gradient by the student's logits",
+                 hint=hint)  # fmt: skip
 
 
-def _gradient_hint(z: Tensor, t: Tensor, labels: Tensor, got: Tensor, slope: Tensor) -> str:
-    mistakes = []
-    for key, value in _loss_mistakes(z, t.detach(), labels, 3.0, 0.6):
-        if value.requires_grad:
-            mistakes.append((key, torch.autograd.grad(value, z, retain_graph=True)[0]))
-    return tools.first_match(got, mistakes, slope) or ("" if bool(got.any()) else "loss-has-a-gradient")
-
-
-def check_temperature(student: Any, seed: int) -> None:
+def check_temperature(student: Any, rng: np.random.Generator) -> None:
     """At high temperature the soft gradient is (z - v) / (C n), z and v centred: it no longer depends on T."""
-    z, t, labels = logits_and_labels(seed, (4, 4, 3, 2))
+    z, t, labels = logits_and_labels(rng, (4, 4, 3, 2))
     limit = ((z - z.mean(dim=1, keepdim=True)) - (t - t.mean(dim=1, keepdim=True))) / 4 / (4 * 3 * 2)
-    for temperature in (1e3, 1e4):
-        leaf = z.clone().requires_grad_(True)
-        answer = student(leaf, t, labels, temperature=temperature, alpha=1.0)
-        loss = tools.as_tensor(answer, "the loss", (), "mean-over-pixels", "loss-has-a-gradient")
-        expect(loss.requires_grad, "the loss is cut off from the student", hint="loss-has-a-gradient")
-        loss.backward()  # type: ignore[no-untyped-call]
-        assert leaf.grad is not None
-        got, norm = leaf.grad, float(limit.norm())
+    for temperature in (float(rng.uniform(900, 1100)), 1e4):
+        got = _gradient(student.run(probes.distilled, z, t, labels, temperature, 1.0), z)
+        norm = float(limit.norm())
         ratio = float((got * limit).sum()) / norm**2
         alike = float((got - ratio * limit).norm()) <= 0.02 * abs(ratio) * norm
         powers = [temperature**p for p in (-3, -2, -1, 1)]
@@ -460,33 +403,30 @@ AT_ONCE = 50
 """Images that the teacher is asked about at a time."""
 
 
-def compare_asked(student: Any, seed: int, count: int) -> None:
+def compare_asked(student: Any, rng: np.random.Generator, count: int) -> None:
     """The answers are those of the teacher in eval mode, without a graph; the teacher is the same afterwards."""
-    teacher = tools.small_network(seed, 6, dropout=0.2).train()  # a teacher that nobody has put into eval mode yet
-    with torch.no_grad():
-        norm = teacher.get_submodule("1")
-        assert isinstance(norm, nn.BatchNorm2d)
-        norm.num_batches_tracked.fill_(7)  # type: ignore[union-attr]
-    before = tools.state_of(teacher)
-    inputs = torch.from_numpy(tools.small_scenes(np.random.default_rng(seed), count).inputs())
+    dropout = 0.2
+    teacher = tools.small_network(rng, 6, dropout)
+    before = probes.state_of(teacher)
+    inputs = torch.from_numpy(tools.small_scenes(rng, count).inputs())
     expected = np.concatenate(tools.outputs_of(teacher, inputs.numpy(), ["4"])["4"])
     given = f"a teacher in train mode, with batch norm and dropout, and {count} images"
-    sizes: list[int] = []
-    counter = teacher.get_submodule("0").register_forward_pre_hook(lambda _, given: sizes.append(len(given[0])))
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        answer = tools.as_tensor(student(teacher, inputs.clone()), "the answer", expected.shape, "every-image-once")
-    counter.remove()
-    moved = tools.changed(before, teacher)
+    found = student.run(probes.asked, before, inputs, dropout, seed=int(rng.integers(2**31)))
+    answer = tools.as_tensor(found["answer"], "the answer", expected.shape, "every-image-once")
+    moved = tools.changed(before, found["state"])
     expect(not moved, "the teacher changed", got=", ".join(moved), expected="the teacher it was", given=given,
            hint="teacher-in-eval" if all("1." in n for n in moved) else "teacher-is-a-constant")  # fmt: skip
-    expect(not answer.requires_grad, "the answers carry the teacher's graph", got="requires_grad=True", given=given,
+    expect(found["connected"] is False, "the answers carry the teacher's graph", got="requires_grad=True", given=given,
            expected="requires_grad=False", hint="teacher-is-a-constant")  # fmt: skip
-    soft = torch.from_numpy(expected).softmax(dim=1)
-    mistakes: list[tuple[str, Any]] = [("logits-not-probabilities", soft), ("logits-not-probabilities", soft.log())]
+
+    def mistakes() -> tools.Mistakes:
+        soft = torch.from_numpy(expected).softmax(dim=1)
+        return [("logits-not-probabilities", soft), ("logits-not-probabilities", soft.log())]
+
     hint = tools.first_match(answer, mistakes, expected) or "teacher-in-eval"
     expect_close(answer.numpy(), expected, rtol=1e-3, atol=1e-4, given=given, hint=hint, what="the teacher's logits")
-    expect(max(sizes, default=0) <= AT_ONCE, "the teacher was asked about too many images at once", got=max(sizes),
+    most = max(found["sizes"])
+    expect(most <= AT_ONCE, "the teacher was asked about too many images at once", got=most,
            expected=f"at most {AT_ONCE}", given=given, hint="fifty-at-a-time", credit=0.5)  # fmt: skip
 
 
@@ -540,33 +480,34 @@ STEP_VARIANTS = (
 )
 
 
-def compare_steps(distil_step: Any, seed: int, steps: int = 3) -> None:
+def compare_steps(student: Any, rng: np.random.Generator, steps: int = 3) -> None:
     """After some steps the student is where it should be."""
-    pupil = tools.small_network(seed + 1, 4).eval()
-    rng = np.random.default_rng(seed)
-    batches = [tools.small_scenes(rng, 5) for _ in range(steps)]
-    wanted = [torch.from_numpy(rng.normal(0, 2, (5, 4, 8, 8)).astype(np.float32)) for _ in range(steps)]
-    temperature, alpha = 2.5, 0.4
+    state = probes.state_of(tools.small_network(rng))
+    scenes = [tools.small_scenes(rng, 5) for _ in range(steps)]
+    batches = [
+        (
+            torch.from_numpy(part.inputs()),
+            torch.from_numpy(part.labels.astype(np.int64)),
+            torch.from_numpy(rng.normal(0, 2, (5, 4, 8, 8)).astype(np.float32)),
+        )
+        for part in scenes
+    ]
+    temperature, alpha, rate = float(rng.uniform(2.2, 2.8)), float(rng.uniform(0.35, 0.45)), 0.05
 
-    def run(step: Any) -> tuple[nn.Module, list[Any]]:
-        learner = copy.deepcopy(pupil)
-        optimiser = torch.optim.SGD(learner.parameters(), lr=0.05)
-        losses = [
-            step(learner, optimiser, torch.from_numpy(batch.inputs()),
-                 torch.from_numpy(batch.labels.astype(np.int64)), says.clone(), temperature=temperature, alpha=alpha)
-            for batch, says in zip(batches, wanted, strict=True)
-        ]  # fmt: skip
-        return learner, losses
+    def run(step: Step) -> tuple[Tensor, list[float]]:
+        learner = probes.small_network(state).eval()
+        optimiser = torch.optim.SGD(learner.parameters(), lr=rate)
+        losses = [step(learner, optimiser, *batch, temperature=temperature, alpha=alpha) for batch in batches]
+        return tools.flat(probes.state_of(learner)), losses
 
-    given = f"a student with batch norms; {steps} steps of SGD, temperature={temperature}, alpha={alpha}"
+    given = f"a student with batch norms; {steps} steps of SGD, temperature={temperature:.2f}, alpha={alpha:.2f}"
     right, expected = run(Step())
-    learner, losses = run(distil_step)
-    got = tools.flat(learner)
-    mistakes = [(key, tools.flat(run(step)[0])) for key, step in STEP_VARIANTS]
-    hint = tools.first_match(got, mistakes, tools.flat(right), rtol=1e-3) or "step-by-step"
-    expect_close(got.numpy(), tools.flat(right).numpy(), rtol=1e-3, atol=1e-5, given=given, hint=hint,
+    found = student.run(probes.stepped, state, batches, temperature, alpha, rate)
+    got, losses = tools.flat(found["state"]), found["answer"]
+    hint = tools.first_match(got, lambda: [(key, run(step)[0]) for key, step in STEP_VARIANTS], right, rtol=1e-3)
+    expect_close(got.numpy(), right.numpy(), rtol=1e-3, atol=1e-5, given=given, hint=hint or "step-by-step",
                  what="the student after the steps")  # fmt: skip
     if any(isinstance(v, Tensor) for v in losses):
-        fail("the loss should be a float", got=type(losses[0]).__name__, expected="a float", hint="loss-as-a-float",
+        fail("the loss should be a float", got=losses[0], expected="a float", hint="loss-as-a-float",
              credit=0.5)  # fmt: skip
     expect_close(losses, expected, rtol=1e-3, given=given, what="the losses", hint="loss-as-a-float")

@@ -1,12 +1,14 @@
 """How `hw2_optimisation` reads a submitted network: as data from a stranger.
 
-Before ONNX Runtime or the twin sees the file, :mod:`robotbrain.untrusted_onnx` judges it by the limits given here. It
-runs in the sandboxed process that grades the notebook.
+Before ONNX Runtime or the twin sees the file, :mod:`robotbrain.untrusted_onnx` judges it by the limits given here. The
+network is measured in the tests' own process, where no student's code runs.
 """
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,7 @@ import numpy as np
 
 from robotbrain.errors import InputError
 from robotbrain.grading import expect, fail
-from robotbrain.grading.suites.hw2_optimisation_tools import Array
+from robotbrain.grading.suites.hw2_optimisation_probes import Array
 from robotbrain.untrusted_onnx import (
     Limits,
     check_graph,
@@ -109,21 +111,26 @@ class Network:
         return np.concatenate(parts)
 
 
-def load(name: Any) -> Network:
-    """Return the network in the file ``name`` beside the notebook, or fail and say what it is instead."""
+def load(student: Any) -> Network:
+    """Return the network in the file that was handed in, or fail and say what it is instead."""
+    name = student.STUDENT
     if not isinstance(name, str) or Path(name).name != name:
         fail("the name of the file should be a plain file name", got=name, expected='"student_int8.onnx"',
              hint="file-beside-the-notebook")  # fmt: skip
-    if not Path(name).is_file():
+    path = student.files / name
+    if not path.is_file():
         fail(f"there is no file {name} beside the notebook", hint="file-beside-the-notebook")
     try:
-        data = read_limited(Path(name), MAX_BYTES)
-        model = checked_model(data)
-        session = _session(data)
+        return _loaded(path, read_limited(path, MAX_BYTES))
     except InputError as error:
         fail(f"{name} cannot be used: {error.what}", got=error.given, expected=error.expected, hint="not-a-network")
         raise  # for the type checker: fail always raises
-    network = Network(Path(name), len(data), model, session)
+
+
+@functools.lru_cache(maxsize=2)
+def _loaded(path: Path, data: bytes) -> Network:
+    """Return the network in a file's bytes; read, checked and opened once for all tests."""
+    network = Network(path, len(data), checked_model(data), _session(data))
     _check_shapes(network)
     return network
 
@@ -193,21 +200,77 @@ def check_own(network: Network) -> None:
     about noise they were never taught. There a quantised copy correlates with its original by more than 0.99, and
     networks that were trained separately by less than 0.9.
     """
-    from robotbrain.optimisation.networks import network_path
-
-    images = np.random.default_rng(1).normal(0, 1, (BATCH, 3, SIZE, SIZE)).astype(np.float32)
-    mine = network.logits(images)
-    for name in ("student", "student_plain", "teacher"):
-        path = network_path(name)
-        if not path.is_file():
-            continue
-        session = _session(path.read_bytes())
-        alike = _likeness(mine, session.run(None, {session.get_inputs()[0].name: images})[0])
+    mine = network.logits(_noise())
+    for name, logits in shipped_logits().items():
+        alike = _likeness(mine, logits)
         expect(alike < SAME_NETWORK, f"this is the kit's {name}", given=f"{network.path.name} and images of noise",
                got=f"logits that correlate with the kit's by {alike:.3f}", hint="train-your-own")  # fmt: skip
+
+
+def _noise() -> Array:
+    return np.random.default_rng(1).normal(0, 1, (6, 3, SIZE, SIZE)).astype(np.float32)
+
+
+@functools.cache
+def shipped_logits() -> dict[str, Array]:
+    """Return what the kit's networks say about noise, by name."""
+    from robotbrain.optimisation.networks import network_path
+
+    found = {}
+    for name in ("student", "student_plain", "teacher"):
+        path = network_path(name)
+        if path.is_file():
+            session = _session(path.read_bytes())
+            found[name] = session.run(None, {session.get_inputs()[0].name: _noise()})[0]
+    return found
 
 
 def _likeness(a: Array, b: Array) -> float:
     """Return the correlation of two networks' logits, apart from what a softmax does not see; -1 to 1."""
     a, b = (v - v.mean(axis=1, keepdims=True) for v in (a.astype(float), b.astype(float)))
     return float((a * b).sum() / max(1e-12, np.linalg.norm(a) * np.linalg.norm(b)))
+
+
+# ---------------------------------------------------------------- how much of it runs in integers
+
+
+def quantised_work(model: Any) -> tuple[int, int]:
+    """Return the multiply-adds of convolutions and products that read dequantised values on both sides, and of all.
+
+    Only what the output depends on counts, so that work which nobody needs makes no network more quantised.
+    """
+    import onnx
+
+    one = onnx.ModelProto()
+    one.CopyFrom(model)
+    for end in (*one.graph.input, *one.graph.output):
+        end.type.tensor_type.shape.dim[0].dim_value = 1
+    del one.graph.value_info[:]  # the file's own claims
+    graph = onnx.shape_inference.infer_shapes(one, strict_mode=True, data_prop=True).graph
+    shapes = {t.name: tuple(t.dims) for t in graph.initializer}
+    for value in (*graph.input, *graph.value_info, *graph.output):
+        shapes[value.name] = tuple(d.dim_value for d in value.type.tensor_type.shape.dim)
+    made = {name: node for node in graph.node for name in node.output}
+    needed, low, every = {end.name for end in graph.output}, 0, 0
+    for node in reversed(graph.node):  # the file is in the order of computation
+        if needed.isdisjoint(node.output):
+            continue
+        needed.update(node.input)
+        if node.op_type in PRODUCTS:
+            work = _multiply_adds(node, shapes)
+            both = all(name in made and made[name].op_type == "DequantizeLinear" for name in node.input[:2])
+            low, every = low + work * both, every + work
+    return low, every
+
+
+PRODUCTS = ("Conv", "ConvTranspose", "Gemm", "MatMul")
+
+
+def _multiply_adds(node: Any, shapes: dict[str, tuple[int, ...]]) -> int:
+    first, second, out = (shapes[name] for name in (*node.input[:2], node.output[0]))
+    if node.op_type == "Conv":
+        return prod(out) * prod(second[1:])
+    if node.op_type == "ConvTranspose":
+        return prod(first) * prod(second[1:])
+    turned = any(attribute.name == "transA" and attribute.i for attribute in node.attribute)
+    return prod(out) * first[0 if turned else -1]

@@ -7,28 +7,19 @@ is wrong, looks whether a typical mistake would have given just that answer; the
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from robotbrain.grading import expect, expect_close, fail
+from robotbrain.grading.suites import hw2_optimisation_probes as probes
 from robotbrain.grading.suites import hw2_optimisation_tools as tools
-from robotbrain.grading.suites.hw2_optimisation_tools import Array
+from robotbrain.grading.suites.hw2_optimisation_probes import Array
 
-VERDICTS = {
-    "a": "breaks",
-    "b": "fine",
-    "c": "wastes",
-    "d": "breaks",
-    "e": "fine",
-    "f": "fine",
-    "g": "breaks",
-    "h": "breaks",
-    "i": "wastes",
-    "j": "breaks",
-}
-"""Of the ten observations about the listing; tests/test_hw2_optimisation.py tries out those that can be tried."""
+VERDICTS = {"a": "breaks", "b": "fine", "c": "wastes", "d": "breaks", "e": "fine"}
+"""Of the first five of the ten observations about the listing; the others are in the hidden tests.
+tests/test_hw2_optimisation.py tries out those that can be tried."""
 
 _VERDICT_HINTS = {
     "a": "zeros-can-move",
@@ -103,23 +94,24 @@ HINTS = {
 }
 
 
-def compare_verdicts(answer: Any, letters: str) -> None:
+def compare_verdicts(answer: Any, key: Mapping[str, str]) -> None:
     """Compare with the key; each letter counts the same."""
     if not isinstance(answer, Mapping):
         fail("VERDICTS should be a dict", got=answer, expected='{"a": "fine", ...}')
     words = ("breaks", "wastes", "fine")
-    wrong = [letter for letter in letters if answer.get(letter) != VERDICTS[letter]]
+    given = {letter: word if isinstance(word := answer.get(letter), str) else "no answer" for letter in key}
+    wrong = [letter for letter in key if given[letter] != key[letter]]
     if not wrong:
         return
-    right = len(letters) - len(wrong)
-    unknown = {k: answer[k] for k in wrong if k in answer and answer[k] not in words}
-    expect(not unknown, "that is not one of the three words", got=unknown, expected=words, credit=right / len(letters))
+    right = len(key) - len(wrong)
+    unknown = {k: given[k] for k in wrong if k in answer and given[k] not in words}
+    expect(not unknown, "that is not one of the three words", got=unknown, expected=words, credit=right / len(key))
     first = wrong[0]
     fail(
-        f"{right} of {len(letters)} are right; look again at {first!r}",
-        got=f"{first}: {answer.get(first, 'no answer')}",
+        f"{right} of {len(key)} are right; look again at {first!r}",
+        got=f"{first}: {given[first]}",
         hint=_VERDICT_HINTS[first],
-        credit=right / len(letters),
+        credit=right / len(key),
     )
 
 
@@ -130,7 +122,7 @@ def compare_scale(student: Any, low: float, high: float, symmetric: bool, bits: 
     """Compare with the closed form; the range as it should be widened must map onto the integers."""
     given = f"low = {low:.4g}, high = {high:.4g}, symmetric={symmetric}, bits={bits}"
     scale, zero = tools.choose_scale(low, high, symmetric, bits)
-    answer = student(low, high, symmetric=symmetric, bits=bits)
+    answer = student.choose_scale(low, high, symmetric=symmetric, bits=bits)
     try:
         got_scale, got_zero = (float(v) for v in answer)
     except (TypeError, ValueError):
@@ -143,11 +135,18 @@ def compare_scale(student: Any, low: float, high: float, symmetric: bool, bits: 
         expect(got_zero == int(got_zero) and 0 <= got_zero <= 2**bits - 1, "the zero point is not one of the levels",
                got=got_zero, given=given, hint="whole-numbers")  # fmt: skip
         return
+    if math.isclose(got_scale, scale, rel_tol=1e-6) and got_zero == zero:
+        return
     hint = _scale_mistake((got_scale, got_zero), low, high, symmetric, bits)
     if math.isclose(got_scale, scale, rel_tol=1e-5) and got_zero != round(got_zero):
         hint = "whole-numbers"
     expect_close((got_scale, got_zero), (scale, zero), rtol=1e-5, atol=0.0, given=given, hint=hint,
                  what="(scale, zero_point)")  # fmt: skip
+
+
+def compare_random_scale(student: Any, rng: np.random.Generator, symmetric: bool, bits: int = 8) -> None:
+    """Compare for a range of random ends on both sides of 0."""
+    compare_scale(student, -float(rng.uniform(0.1, 4)), float(rng.uniform(0.1, 4)), symmetric, bits)
 
 
 def _scale_mistake(answer: tuple[float, float], low: float, high: float, symmetric: bool, bits: int) -> str:
@@ -197,14 +196,17 @@ def forgive_ties(answer: Array, expected: Array, x: Array, scale: Any) -> Array:
 def compare_quantise(student: Any, x: Array, scale: Any, zero_point: int, qmin: int, qmax: int, given: str) -> None:
     """Compare with the nearest level, clipped; in the middle between two levels either will do."""
     expected = tools.quantise(x, scale, zero_point, qmin, qmax)
-    mine = x.copy()
-    array = np.asarray(student(mine, scale, zero_point, qmin=qmin, qmax=qmax))
-    expect(np.array_equal(mine, x), "x was changed", got=mine, expected=x, given=given, hint="leave-the-input")
+    held = student.hold(x.copy())
+    array = np.asarray(student.quantise(held, scale, zero_point, qmin=qmin, qmax=qmax))
+    after = student.fetch(held)
+    expect(np.array_equal(after, x), "x was changed", got=after, expected=x, given=given, hint="leave-the-input")
     if array.dtype.kind not in "iu" and array.dtype.kind in "f":
         cut = array.shape == expected.shape and np.array_equal(np.clip(np.rint(array), qmin, qmax), expected)
         fail("quantise should return an array of integers", got=str(array.dtype), expected="an integer type",
              given=given, hint="whole-numbers" if cut or array.shape == expected.shape else "")  # fmt: skip
     array = forgive_ties(array, expected, x, scale)
+    if array.dtype.kind in "iu" and np.array_equal(array, expected):
+        return
     steps = np.asarray(x, dtype=float) / scale
     near = np.rint(steps)
     shifted = near + zero_point
@@ -238,7 +240,7 @@ def compare_quantise(student: Any, x: Array, scale: Any, zero_point: int, qmin: 
 def compare_dequantise(student: Any, q: Array, scale: Any, zero_point: int, given: str) -> None:
     """Compare with scale * (q - zero_point)."""
     expected = tools.dequantise(q, scale, zero_point)
-    array = np.asarray(student(q.copy(), scale, zero_point))
+    array = np.asarray(student.dequantise(q.copy(), scale, zero_point))
     whole = q.astype(float)
     mistakes: list[tuple[str, Any]] = [
         ("zero-point-ignored", whole * scale),
@@ -256,8 +258,9 @@ def compare_dequantise(student: Any, q: Array, scale: Any, zero_point: int, give
     expect_close(array, expected, rtol=1e-5, atol=1e-7, given=given, hint=hint, what="the dequantised array")
 
 
-def check_round_trip(quantise: Any, dequantise: Any, scale: float, zero_point: int) -> None:
+def check_round_trip(student: Any, scale: float, zero_point: int) -> None:
     """All 256 levels survive the way back and forth, and 0.0 is exact."""
+    quantise, dequantise = student.quantise, student.dequantise
     levels = np.arange(256, dtype=np.uint8)
     back = np.asarray(quantise(dequantise(levels, scale, zero_point), scale, zero_point, qmin=0, qmax=255))
     hint = "zero-point-ignored"
@@ -272,8 +275,9 @@ def check_round_trip(quantise: Any, dequantise: Any, scale: float, zero_point: i
            hint="zero-point-ignored")  # fmt: skip
 
 
-def check_half_a_step(quantise: Any, dequantise: Any, rng: np.random.Generator) -> None:
+def check_half_a_step(student: Any, rng: np.random.Generator) -> None:
     """Within the range nothing is off by more than half a step; beyond it, the nearest end comes out."""
+    quantise, dequantise = student.quantise, student.dequantise
     for _ in range(5):
         low, high = -float(rng.uniform(0.1, 5)), float(rng.uniform(0.1, 5))
         scale, zero = tools.choose_scale(low, high)
@@ -292,9 +296,9 @@ def check_half_a_step(quantise: Any, dequantise: Any, rng: np.random.Generator) 
 def compare_weights(student: Any, weight: Array, per_channel: bool, given: str) -> None:
     """Compare scales and integers with symmetric int8."""
     _, scale = tools.quantise_weights(weight, per_channel)
-    answer = student(weight.copy(), per_channel=per_channel)
+    answer = student.quantise_weights(weight.copy(), per_channel=per_channel)
     if not isinstance(answer, (tuple, list)) or len(answer) != 2:
-        fail("the answer should be a pair", got=type(answer).__name__, expected="(q, scale)", given=given)
+        fail("the answer should be a pair", got=answer, expected="(q, scale)", given=given)
     got_q, got_scale = np.asarray(answer[0]), np.asarray(answer[1], dtype=float)
     key = "one-scale-each" if per_channel else "one-scale-for-all"
     if not per_channel and got_scale.size == 1:
@@ -357,33 +361,13 @@ def channels_of_all_sizes(rng: np.random.Generator, shape: tuple[int, ...], dead
 # ---------------------------------------------------------------- calibration
 
 
-class OnePass:
-    """Copies of the batches, to be walked through once as a generator is; it counts how often that is tried."""
-
-    def __init__(self, batches: Sequence[Array]) -> None:
-        self._rest = [batch.copy() for batch in reversed(batches)]
-        self.walks = 0
-
-    def __iter__(self) -> Iterator[Array]:
-        return self
-
-    def __next__(self) -> Array:
-        if not self._rest:
-            self.walks += 1
-            raise StopIteration
-        return self._rest.pop()
-
-
 def compare_range(student: Any, batches: Sequence[Array], percentile: float | None, given: str) -> None:
     """Compare with the range of all values; a percentile between two neighbouring values may be either of them."""
     low, high = tools.activation_range(batches, percentile)
-    source = OnePass(batches)
-    try:
-        answer = student(source, percentile=percentile)
-    except (TypeError, ValueError) as error:
-        if source.walks < 2:
-            raise
-        fail(f"no answer: {error}", given=given, expected="(low, high)", hint="once-only")
+    found = student.run(probes.walked, batches, percentile)
+    if "again" in found:
+        fail(f"no answer: {found['again']}", given=given, expected="(low, high)", hint="once-only")
+    answer = found["answer"]
     try:
         got = tuple(float(v) for v in answer)
     except (TypeError, ValueError):
@@ -395,8 +379,7 @@ def compare_range(student: Any, batches: Sequence[Array], percentile: float | No
         slack = 1e-6 * around[1]
         if around[0] - slack <= got[1] <= around[1] + slack and math.isclose(got[0], -got[1], rel_tol=1e-6):
             return
-    mistakes = _range_mistakes(batches, everything, percentile)
-    hint = tools.first_match(got, mistakes, (low, high))
+    hint = tools.first_match(got, lambda: _range_mistakes(batches, everything, percentile), (low, high))
     expect_close(got, (low, high), rtol=1e-5, given=given, hint=hint, what="(low, high)")
 
 
@@ -426,18 +409,30 @@ def compare_calibration(
     student: Any, rng: np.random.Generator, percentile: float | None = None, training: bool = False
 ) -> None:
     """Compare with the ranges of the layers' outputs over the calibration images; the network stays as it was."""
-    network = tools.small_network(int(rng.integers(1000)))
-    network.train(training)
+    network = tools.small_network(rng)
     layers = ["0", "2", "4"]
     splits = tools.small_splits(rng)
-    before = tools.state_of(network)
+    before = probes.state_of(network)
+    values = tools.outputs_of(network, splits["calibration"].inputs(), layers)
 
-    def ranges(scenes: Any, names: Sequence[str] = layers, method: str = "linear") -> list[tuple[float, float]]:
+    def ranges(scenes: Any, names: Sequence[str] = layers) -> list[tuple[float, float]]:
         found = tools.outputs_of(network, scenes.inputs(), names)
-        return [tools.activation_range(found[name], percentile, method) for name in names]
+        return [tools.activation_range(found[name], percentile) for name in names]
 
-    expected = ranges(splits["calibration"])
-    answer = student(network, splits, list(layers), percentile=percentile)
+    def mistakes() -> tools.Mistakes:
+        inside = [tools.activation_range([splits["calibration"].inputs()], percentile),
+                  *ranges(splits["calibration"], ["1", "3"])]  # fmt: skip
+        all_values = [tools.activation_range(values[name]) for name in layers]
+        return [
+            ("output-of-the-layer", inside),
+            *_calibration_mistakes(splits, ranges),
+            *_batch_mistakes([np.concatenate(values[name]) for name in layers], percentile),
+            *([] if percentile is None else [("percentile-too", all_values)]),
+        ]
+
+    expected = [tools.activation_range(values[name], percentile) for name in layers]
+    found = student.run(probes.calibrated, before, training, splits, layers, percentile)
+    answer = found["answer"]
     given = f"a small network, layers {layers}, {len(splits['calibration'])} images for calibration"
     if not isinstance(answer, Mapping) or set(answer) != set(layers):
         fail("the answer should be a dict with an entry for each layer", got=answer, given=given,
@@ -446,25 +441,17 @@ def compare_calibration(
         got = np.array([[float(v) for v in answer[name]] for name in layers])
     except (TypeError, ValueError):
         fail("each entry should be a pair of numbers", got=answer, expected="(low, high)", given=given)
-    tools.expect_untouched(network, before, "the network", "calibrate-in-eval")
-    inside = [tools.activation_range([splits["calibration"].inputs()], percentile),
-              *ranges(splits["calibration"], ["1", "3"])]  # fmt: skip
-    mistakes = [("output-of-the-layer", inside), *_calibration_mistakes(splits, ranges)]
-    values = tools.outputs_of(network, splits["calibration"].inputs(), layers)
-    mistakes += _batch_mistakes([np.concatenate(values[name]) for name in layers], percentile)
-    if percentile is not None:
-        mistakes.append(("percentile-too", [tools.activation_range(values[name]) for name in layers]))
-    hint = tools.first_match(got, mistakes, expected, rtol=1e-3)
+    tools.expect_untouched(before, found["state"], "the network", "calibrate-in-eval")
     if percentile is not None:  # between two neighbouring values, either of them will do
-        ends = [np.asarray(ranges(splits["calibration"], method=m)) for m in ("lower", "higher")]
-        got = np.where((np.abs(got) >= np.abs(ends[0])) & (np.abs(got) <= np.abs(ends[1])), expected, got)
+        low, high = (np.abs([tools.activation_range(values[name], percentile, method) for name in layers])
+                     for method in ("lower", "higher"))  # fmt: skip
+        near = got.shape == low.shape and (np.abs(got) >= low) & (np.abs(got) <= high) & (np.sign(got) == (-1, 1))
+        got = np.where(near, expected, got)
+    hint = tools.first_match(got, mistakes, expected, rtol=1e-3)
     expect_close(got, expected, rtol=1e-3, atol=1e-5, given=given, hint=hint, what="the table of ranges")
-    hooks = sum(len(m._forward_hooks) + len(m._forward_pre_hooks) for m in network.modules())
-    expect(hooks == 0, "hooks are still on the network", got=hooks, expected=0, hint="take-hooks-off")
-    modes = {m.training for m in network.modules()}
-    expect(modes == {training}, "the network is in another mode than before", given=given, credit=0.5,
-           got="train" if True in modes else "eval", expected="train" if training else "eval",
-           hint="leave-as-found")  # fmt: skip
+    expect(found["hooks"] == 0, "hooks are still on the network", got=found["hooks"], expected=0,
+           hint="take-hooks-off")  # fmt: skip
+    tools.expect_mode(found["training"], network, training, given, "leave-as-found")
 
 
 def _batch_mistakes(values: Sequence[Array], percentile: float | None) -> list[tuple[str, Any]]:
@@ -484,8 +471,8 @@ def _calibration_mistakes(splits: Mapping[str, Any], ranges: Callable[..., Any])
     for parts in (("train", "calibration"), ("calibration", "test"), ("train", "test")):
         both = [np.concatenate([splits[name][k] for name in parts]) for k in (0, 1)]
         key = "not-the-test-set" if "test" in parts else "calibration-split"
-        mistakes.append((key, ranges(tools.SmallScenes(both[0], both[1]))))
-    mistakes.append(("not-the-test-set", ranges(tools.SmallScenes(everything[0], everything[1]))))
+        mistakes.append((key, ranges(probes.SmallScenes(both[0], both[1]))))
+    mistakes.append(("not-the-test-set", ranges(probes.SmallScenes(everything[0], everything[1]))))
     scenes = splits["calibration"]
 
     class Raw:

@@ -6,8 +6,8 @@ They are independent of `robotbrain.optimisation`, whose functions tests/test_hw
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,38 +16,29 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from robotbrain.grading import expect, fail
+from robotbrain.grading.suites import hw2_optimisation_probes as probes
+from robotbrain.grading.suites.hw2_optimisation_probes import CLASSES, Array, SmallScenes
 
 torch.optim.Adam([torch.zeros(1, requires_grad=True)])  # the first optimiser loads for seconds: now, not in a check
 
-Array = NDArray[Any]
 IGNORE = 255
 """Label of a pixel that nobody has labelled."""
-CLASSES = 4
+Mistakes = Sequence[tuple[str, Any]]
+"""Keys of hints, and the answers that show the mistakes."""
 
 
-class SmallScenes(NamedTuple):
-    """What `robotbrain.optimisation.data.Scenes` looks like, of any image size."""
+def first_match(answer: Any, mistakes: Mistakes | Callable[[], Mistakes], expected: Any, rtol: float = 1e-4) -> str:
+    """Return the hint of the first mistake that gives ``answer`` and not ``expected``, or ''.
 
-    images: NDArray[np.uint8]
-    labels: NDArray[np.uint8]
-
-    def __len__(self) -> int:
-        return len(self.images)
-
-    def inputs(self) -> NDArray[np.float32]:
-        """Return the network's input (N, 3, H, W), normalised."""
-        from robotbrain.pipeline.segmentation import normalise
-
-        return normalise(self.images)
-
-
-def first_match(answer: Any, mistakes: Sequence[tuple[str, Any]], expected: Any, rtol: float = 1e-4) -> str:
-    """Return the hint of the first mistake that gives ``answer`` and not ``expected``, or ''."""
+    ``mistakes`` that are costly are a function, which a right answer does not call.
+    """
     given = _numbers(answer)
     if given is None:
         return ""
     right = np.asarray(expected, dtype=float)
-    for hint, wrong in mistakes:
+    if given.shape == right.shape and np.allclose(given, right, rtol=min(rtol, 1e-6), atol=1e-9, equal_nan=True):
+        return ""
+    for hint, wrong in mistakes() if callable(mistakes) else mistakes:
         value = _numbers(wrong)
         if value is None or value.shape != given.shape:
             continue
@@ -71,37 +62,51 @@ def as_tensor(answer: Any, what: str, shape: tuple[int, ...], hint: str = "", no
     ``hint`` is for another shape, and for another type, too, unless ``no_tensor`` is.
     """
     if not isinstance(answer, Tensor):
-        fail(f"{what} should be a torch tensor, but is of type {type(answer).__name__}", got=answer,
+        fail(f"{what} should be a torch tensor", got=answer,
              expected=f"a tensor of shape {shape}", hint=no_tensor or hint)  # fmt: skip
     if tuple(answer.shape) != shape:
         fail(f"{what} has shape {tuple(answer.shape)}, but shape {shape} is expected", got=tuple(answer.shape),
              expected=shape, hint=hint)  # fmt: skip
-    tensor: Tensor = answer
+    tensor: Tensor = answer.detach()
     return tensor
 
 
 # ---------------------------------------------------------------- small networks and scenes
 
 
-def small_network(seed: int, width: int = 4, dropout: float = 0.0) -> nn.Sequential:
-    """Return a network of every kind of layer that a mask or a mode could forget; (N, 3, H, W) to (N, 4, H, W)."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        network = nn.Sequential(
-            nn.Conv2d(3, width, 3, padding=1),
-            nn.BatchNorm2d(width),
-            nn.ReLU(),
-            nn.Dropout(dropout),
-            nn.Conv2d(width, CLASSES, 1),
-        )
-        norm = network[1]
-        assert isinstance(norm, nn.BatchNorm2d) and norm.running_mean is not None and norm.running_var is not None
-        # Statistics and factors of a network that has learned something: train and eval mode must differ.
-        norm.running_mean.copy_(0.3 * torch.randn(width))
-        norm.running_var.copy_(torch.rand(width) + 0.5)
-        with torch.no_grad():
-            norm.weight.copy_(torch.rand(width) + 0.5)
-            norm.bias.copy_(0.3 * torch.randn(width))
+def small_network(rng: np.random.Generator, width: int = 4, dropout: float = 0.0) -> nn.Sequential:
+    """Return the probes' network with random numbers."""
+    generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
+
+    def noise(*shape: int, fan_in: int = 1) -> Tensor:
+        return torch.empty(shape).uniform_(-(fan_in**-0.5), fan_in**-0.5, generator=generator)
+
+    # Statistics and factors of a network that has learned something: train and eval mode must differ.
+    state = {
+        "0.weight": noise(width, 3, 3, 3, fan_in=27),
+        "0.bias": noise(width, fan_in=27),
+        "1.weight": torch.rand(width, generator=generator) + 0.5,
+        "1.bias": 0.3 * torch.randn(width, generator=generator),
+        "1.running_mean": 0.3 * torch.randn(width, generator=generator),
+        "1.running_var": torch.rand(width, generator=generator) + 0.5,
+        "1.num_batches_tracked": torch.tensor(7),
+        "4.weight": noise(CLASSES, width, 1, 1, fan_in=width),
+        "4.bias": noise(CLASSES, fan_in=width),
+    }
+    return probes.small_network(state, dropout)
+
+
+def mixed_network(rng: np.random.Generator) -> probes.Mixed:
+    """Return the probes' network of many kinds of layers with random numbers; its layers' weights differ in size."""
+    generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
+    network = probes.Mixed()
+    with torch.no_grad():
+        for name, parameter in network.named_parameters():
+            parameter.copy_((2 * torch.rand(parameter.shape, generator=generator) - 1) / 4)
+            if name == "body.3.weight":
+                parameter.mul_(0.1)
+            if name == "body.1.weight":
+                parameter.add_(1.0)
     return network
 
 
@@ -128,26 +133,27 @@ def small_splits(rng: np.random.Generator, counts: Sequence[int] = (12, 110, 6, 
     }
 
 
-def state_of(network: nn.Module) -> dict[str, Tensor]:
-    """Return copies of all parameters and buffers by name."""
-    return {name: value.detach().clone() for name, value in network.state_dict().items()}
-
-
-def changed(before: dict[str, Tensor], network: nn.Module) -> list[str]:
+def changed(before: Mapping[str, Tensor], now: Any) -> list[str]:
     """Return the names whose values are not those of ``before``."""
-    now = network.state_dict()
-    return [name for name, value in before.items() if name not in now or not torch.equal(value, now[name])]
+    return [n for n, value in before.items() if not (isinstance(now[n], Tensor) and torch.equal(value, now[n]))]
 
 
-def expect_untouched(network: nn.Module, before: dict[str, Tensor], what: str, hint: str) -> None:
-    """Fail where a parameter or a statistic of ``network`` changed."""
-    names = changed(before, network)
+def expect_untouched(before: Mapping[str, Tensor], now: Any, what: str, hint: str) -> None:
+    """Fail where a parameter or a statistic of a network is not as ``before``."""
+    names = changed(before, now)
     expect(not names, f"{what} was changed", got=", ".join(names[:6]), expected="the numbers it came with", hint=hint)
 
 
-def flat(network: nn.Module) -> Tensor:
+def expect_mode(found: Any, network: nn.Module, training: bool, given: str, hint: str) -> None:
+    """Fail, for half of the points, where a network's modules are not all in the mode that they came in."""
+    expect(found == [training] * len(list(network.modules())), "the network is in another mode than before",
+           given=given, credit=0.5, got="train" if True in found else "eval",
+           expected="train" if training else "eval", hint=hint)  # fmt: skip
+
+
+def flat(state: Mapping[str, Tensor]) -> Tensor:
     """Return all floating-point numbers of a network, statistics included, in one row."""
-    return torch.cat([v.detach().ravel() for v in network.state_dict().values() if v.is_floating_point()])
+    return torch.cat([v.detach().ravel() for v in state.values() if v.is_floating_point()])
 
 
 # ---------------------------------------------------------------- our own answers: numbers
@@ -195,7 +201,7 @@ def activation_range(
 
 def outputs_of(network: nn.Module, inputs: Array, layers: Sequence[str], train: bool = False) -> dict[str, list[Array]]:
     """Return the outputs of the named layers, batch by batch; ``network`` is put back as it was."""
-    modes, before = [(m, m.training) for m in network.modules()], state_of(network)
+    modes, before = [(m, m.training) for m in network.modules()], probes.state_of(network)
     found: dict[str, list[Array]] = {name: [] for name in layers}
     modules = dict(network.named_modules())
 
@@ -226,15 +232,6 @@ def magnitude_mask(weight: Tensor, sparsity: float) -> Tensor:
     mask = torch.ones(weight.numel(), dtype=torch.bool)
     mask[drop] = False
     return mask.view(weight.shape)
-
-
-def prunable(network: nn.Module) -> dict[str, Tensor]:
-    """Return the weights of all convolutions and linear layers by parameter name."""
-    return {
-        f"{name}.weight" if name else "weight": module.weight
-        for name, module in network.named_modules()
-        if isinstance(module, (nn.Conv2d, nn.Linear))
-    }
 
 
 # ---------------------------------------------------------------- our own answers: distillation

@@ -5,15 +5,16 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
-from robotbrain.grading import Suite, expect
+from robotbrain.grading import Student, Suite, expect
 from robotbrain.grading.suites import hw3_performance_drives as drives
 from robotbrain.grading.suites import hw3_performance_tools as tools
 from robotbrain.grading.suites import hw3_performance_traces as traces
 from robotbrain.grading.suites import hw3_performance_verdict as verdict
+from robotbrain.grading.suites.planner_bench import PlannerBench, open_room, walled_room, with_box
+from robotbrain.ros.context import CallbackRecord
 
 suite = Suite("hw3_performance")
 
@@ -31,6 +32,7 @@ suite.exercise("validate", title="5.1 Is it really better?", points=10)
 
 # A student's planner that is not right yet must not spoil the repair: the kit's own stands in.
 suite.reference("ReusingPlanner", "robotbrain.pipeline.nodes.planner:PlannerNode")
+suite.crosses(CallbackRecord)
 
 HELPERS = (
     "GridFrame",
@@ -152,135 +154,148 @@ for _key, _text in _HINTS.items():
 
 
 @suite.test("ages", points=3, name="four images, five commands", reread="Exercise 1.1")
-def ages_small(student: Any) -> None:
-    trace = traces.camera_to_command([(0, 2), (100, 101), (200, 240), (300, 301)], [10, 60, 160, 288, 360])
+def ages_small(student: Student) -> None:
+    late = int(student.rng("late").integers(8))  # ms
+    trace = traces.camera_to_command(
+        [(0, 2), (100, 101), (200, 240 + late), (300, 301)], [10, 60, 160, 288 + late, 360]
+    )
     tools.compare_ages(
-        student.command_ages_ms,
+        student,
         trace,
-        "images taken at 0, 100, 200, 300 ms, their points in the controller's hands at 41, 140, 279, 340 ms; commands "
-        "started at 10, 60, 160, 288, 360 ms, each 2 ms long",
+        f"images taken at 0, 100, 200, 300 ms, their points in the controller's hands at 41, 140, {279 + late}, 340 ms; "
+        f"commands started at 10, 60, 160, {288 + late}, 360 ms, each 2 ms long",
     )
 
 
 @suite.test("ages", points=1, name="percentiles of a long tail", reread="Exercise 1.1, last paragraph")
-def ages_summary(student: Any) -> None:
-    tools.compare_summary(student.summarise, [20.0] * 90 + [400.0] * 7 + [900.0, 1500.0, 2500.0])
+def ages_summary(student: Student) -> None:
+    slow = float(student.rng("tail").integers(300, 600))
+    tools.compare_summary(student, [20.0] * 90 + [slow] * 7 + [900.0, 1500.0, 2500.0])
 
 
 @suite.test("ages", points=1, name="percentiles of nothing", hint="nothing-is-nan", reread="Exercise 1.1")
-def ages_nothing(student: Any) -> None:
-    tools.compare_summary(student.summarise, [])
+def ages_nothing(student: Student) -> None:
+    tools.compare_summary(student, [])
+    # Something is not nothing.
+    tools.compare_summary(student, [float(student.rng("something").integers(20, 90))])
 
 
 @suite.test("deadlines", points=3, name="one slow, one stuck, one not due", reread="Exercise 1.2")
-def deadlines_small(student: Any) -> None:
-    trace = traces.camera_to_command(
-        [(0, 2), (100, 190), (200, 240), (300, math.inf), (400, 401), (500, math.inf)], [], end=560
+def deadlines_small(student: Student) -> None:
+    rng = student.rng("deadlines")
+    fates = rng.permutation(
+        ["in time", "late", "stuck", *rng.choice(["in time", "late", "stuck"], rng.integers(3, 10))]
     )
-    tools.compare_misses(
-        student.deadline_misses,
-        trace,
-        100.0,
-        "images at 0, 100, …, 500 ms, done at 40, 228, 278, never, 439 and never; the recording ends at 560 ms; "
-        "deadline 100 ms",
-    )
+    starts = {"in time": 2.0, "late": 90.0, "stuck": math.inf}  # ms after the image was taken; then 38 ms of work
+    images = [(100.0 * k, 100.0 * k + starts[fate]) for k, fate in enumerate((*fates, "stuck"))]
+    trace = traces.camera_to_command(images, [], end=images[-1][0] + 60)
+    given = f"an image every 100 ms, in this order: {', '.join(fates)}; the last is not due yet; deadline 100 ms"
+    tools.compare_misses(student, trace, 100.0, given)
 
 
 @suite.test("rhythm", points=3, name="a timer that stumbles", reread="Exercise 1.3")
-def rhythm_small(student: Any) -> None:
-    trace = traces.camera_to_command([], [0, 50, 103, 150, 212, 250, 301])
-    tools.compare_rhythm(
-        student.timer_rhythm, trace, 50.0, "a 50 ms timer that started at 0, 50, 103, 150, 212, 250 and 301 ms"
-    )
+def rhythm_small(student: Student) -> None:
+    late = 150 + int(student.rng("late").integers(20))  # ms
+    trace = traces.camera_to_command([], [0, 50, 103, late, 212, 250, 301])
+    tools.compare_rhythm(student, trace, 50.0, f"a 50 ms timer that started at 0, 50, 103, {late}, 212, 250 and 301 ms")
 
 
 # ---------------------------------------------------------------- Part 2: identify
 
 
 @suite.test("utilisation", points=4, name="camera, network, controller", reread="Exercise 2.1")
-def utilisation_small(student: Any) -> None:
-    trace = traces.camera_to_command([(0, 0), (100, 100), (200, 200)], [50, 100, 150], end=400)
+def utilisation_small(student: Student) -> None:
+    inference, end = int(student.rng("network").integers(25, 36)), int(student.rng("end").integers(380, 420))  # ms
+    trace = traces.camera_to_command([(0, 0), (100, 100), (200, 200)], [50, 100, 150], inference=inference, end=end)
     tools.compare_utilisation(
-        student.utilisation,
+        student,
         trace,
-        "4 cores and a GPU for 400 ms; three images cost 8 ms CPU + 30 ms GPU each in thread (1, 0); in (2, 0) run "
-        "three callbacks of 1 ms and three of 2 ms",
+        f"4 cores and a GPU for {end} ms; three images cost 8 ms CPU + {inference} ms GPU each in thread (1, 0); "
+        "in (2, 0) run three callbacks of 1 ms and three of 2 ms",
     )
 
 
 @suite.test("chain", points=3, name="from a command back to the camera", reread="Exercise 2.2")
-def chain_small(student: Any) -> None:
-    trace = traces.camera_to_command([(0, 2), (100, 101), (200, 240)], [60, 160, 330])
+def chain_small(student: Student) -> None:
+    rng = student.rng("chain")
+    count = int(rng.integers(3, 9))
+    images = [(100.0 * k, 100.0 * k + float(rng.integers(1, 40))) for k in range(count)]
+    times = [60.0, *(100.0 * k + 60 for k in sorted(rng.choice(np.arange(1, count), 2, replace=False)))]
+    trace = traces.camera_to_command(images, times)
     commands = [m.id for m in trace.messages if m.name == tools.COMMAND]
     tools.compare_chains(
-        student.causal_chain,
+        student,
         trace,
         commands,
-        "three images and three commands; follow {'/controller': '/perception/points'}",
+        f"{count} images and three commands; follow {{'/controller': '/perception/points'}}",
     )
 
 
 @suite.test("chain", points=2, name="the parts add up", reread="Exercise 2.2, the budget")
-def budget_small(student: Any) -> None:
-    trace = traces.camera_to_command([(0, 12)], [75])
-    links = list(trace.callbacks)
+def budget_small(student: Student) -> None:
+    wait, at = 12, 70 + int(student.rng("timer").integers(20))  # ms
+    links = list(traces.camera_to_command([(0, wait)], [at]).callbacks)
     tools.compare_budget(
-        student.latency_budget,
+        student,
         links,
-        "taken at 0; perception from 12 to 50 ms, the controller takes the points until 51, its timer runs from 75 to 77",
+        "taken at 0; perception from 12 to 50 ms, the controller takes the points until 51, its timer runs from "
+        f"{at} to {at + 2}",
     )
 
 
 @suite.test("bottleneck", points=2, name="a network that fills its thread", reread="Exercise 2.3")
-def bottleneck_gpu(student: Any) -> None:
-    trace, answer = traces.random_pipeline(np.random.default_rng(5), "gpu")
+def bottleneck_gpu(student: Student) -> None:
+    trace, answer = traces.random_pipeline(student.rng("gpu"), "gpu")
     tools.compare_bottleneck(
-        student.find_bottleneck,
-        trace,
-        answer,
-        "four stages, each with a thread of its own; one of them infers for long",
+        student, trace, answer, "four stages, each with a thread of its own; one of them infers for long"
     )
 
 
 @suite.test("bottleneck", points=2, name="four stages in one thread", reread="Exercise 2.3")
-def bottleneck_sharing(student: Any) -> None:
-    trace, answer = traces.random_pipeline(np.random.default_rng(6), "sharing")
-    tools.compare_bottleneck(
-        student.find_bottleneck, trace, answer, "four stages of about 45 ms in one thread, ten messages a second"
-    )
+def bottleneck_sharing(student: Student) -> None:
+    trace, answer = traces.random_pipeline(student.rng("sharing"), "sharing")
+    tools.compare_bottleneck(student, trace, answer, "four stages of about 45 ms in one thread, ten messages a second")
 
 
 # ---------------------------------------------------------------- Part 3: propose
 
 
 @suite.test("gain", points=3, name="one stage twice as fast", reread="Exercise 3.1")
-def gain_small(student: Any) -> None:
-    tools.compare_gain(student.predict_gain, {"camera": 10.0, "network": 60.0, "planner": 30.0}, {"network": 3.0})
+def gain_small(student: Student) -> None:
+    camera = float(student.rng("gain").integers(6, 15))
+    tools.compare_gain(student, {"camera": camera, "network": 60.0, "planner": 30.0}, {"network": 3.0})
 
 
 @suite.test("prediction", points=2, name="a faster network in a planted pipeline", reread="Exercise 3.2")
-def prediction_small(student: Any) -> None:
-    trace = traces.camera_to_command([(0, 0), (100, 100), (200, 200)], [50], inference=60.0)
-    tools.compare_prediction(student.predict_service_ms, trace, (tools.PERCEPTION, tools.IMAGE), "gpu", 4.0)
+def prediction_small(student: Student) -> None:
+    inference = float(student.rng("prediction").integers(50, 70))
+    trace = traces.camera_to_command([(0, 0), (100, 100), (200, 200)], [50], inference=inference)
+    tools.compare_prediction(student, trace, (tools.PERCEPTION, tools.IMAGE), "gpu", 4.0)
 
 
 # ---------------------------------------------------------------- Part 4: implement
 
 
+def _around(student: Student, label: str, x: float, y: float) -> tuple[float, float]:
+    """A place within 10 cm of (x, y), another one for each student."""
+    dx, dy = student.rng(label).uniform(-0.1, 0.1, 2)
+    return round(x + float(dx), 3), round(y + float(dy), 3)
+
+
 @suite.test("planner", points=2, name="a first path around a wall", reread="Exercise 4.1", time_limit_s=20)
-def planner_first(student: Any) -> None:
-    room = drives.walled_room()
-    bench = drives.Bench(student.ReusingPlanner)
+def planner_first(student: Student) -> None:
+    room, start, goal = walled_room(), _around(student, "start", -1.5, 0.4), _around(student, "goal", 1.5, 0.4)
+    bench = PlannerBench.of(student, "ReusingPlanner")
     bench.show(room)
-    drives.check_path(bench.ask((-1.5, 0.4), (1.5, 0.4)), room, (-1.5, 0.4), (1.5, 0.4))
+    drives.check_path(bench.ask(start, goal), room, start, goal)
 
 
 @suite.test(
     "planner", points=2, name="the same goal: the rest of the same path", reread="Exercise 4.1", time_limit_s=20
 )
-def planner_reuses(student: Any) -> None:
-    room, goal = drives.walled_room(), (1.5, 0.4)
-    bench = drives.Bench(student.ReusingPlanner)
+def planner_reuses(student: Student) -> None:
+    room, goal = walled_room(), _around(student, "goal", 1.5, 0.4)
+    bench = PlannerBench.of(student, "ReusingPlanner")
     bench.show(room)
     path = bench.ask((-1.5, 0.4), goal)
     expect(len(path) > 4, "the first path is empty or very short", got=path)
@@ -293,12 +308,12 @@ def planner_reuses(student: Any) -> None:
 
 
 @suite.test("planner", points=2, name="a new obstacle on the path", reread="Exercise 4.1", time_limit_s=20)
-def planner_obstacle(student: Any) -> None:
-    room, start, goal = drives.open_room(), (-1.5, 0.0), (1.5, 0.0)
-    bench = drives.Bench(student.ReusingPlanner)
+def planner_obstacle(student: Student) -> None:
+    room, start, goal = open_room(), (-1.5, 0.0), (1.5, 0.0)
+    bench = PlannerBench.of(student, "ReusingPlanner")
     bench.show(room)
     bench.ask(start, goal)
-    blocked = drives.with_box(room, 0.6, 0.0)
+    blocked = with_box(room, 0.4 + float(student.rng("box").uniform(0, 0.4)), 0.0)
     bench.show(blocked)
     drives.check_path(bench.ask((-1.2, 0.0), goal), blocked, (-1.2, 0.0), goal, hint="check-the-rest")
 
@@ -306,46 +321,53 @@ def planner_obstacle(student: Any) -> None:
 @suite.test(
     "repair", points=1, name="keeps the requirements", hint="keep-requirements", reread="Exercise 4.2", time_limit_s=20
 )
-def repair_requirements(student: Any) -> None:
+def repair_requirements(student: Student) -> None:
     from robotbrain.pipeline.inherited import inherited_brain, unmet_requirements
 
-    setup = drives.repaired(student)
-    expect(setup != inherited_brain(), "nothing has changed")
-    broken = unmet_requirements(setup)
+    repair = drives.repaired(student)
+    expect(repair.own_planner or repair.setup != inherited_brain(), "nothing has changed")
+    broken = unmet_requirements(repair.setup)
     expect(not broken, "a requirement is broken", got="; ".join(broken), expected="all requirements met")
 
 
 @suite.test("repair", points=2, name="drives to the marker, in time", reread="Exercise 4.2", time_limit_s=60)
-def repair_drives(student: Any) -> None:
+def repair_drives(student: Student) -> None:
+    drives.check_planner(student, "", student.rng("drive"))
     run = drives.drive_repaired(student, 1)
     expect(run.success, "the robot does not arrive", got=run.reason, hint="measure-again")
-    drives.check_latency(run, "orin-nano-8gb:15W")
+    drives.check_latency(run, drives.NANO)
 
 
 # ---------------------------------------------------------------- Part 5: validate
 
 
 @suite.test("validate", points=2, name="speed-up in seven worlds", reread="Exercise 5.1")
-def validate_speedup(student: Any) -> None:
-    rng = np.random.default_rng(3)
+def validate_speedup(student: Student) -> None:
+    rng = student.rng("speedup")
     before = verdict.random_runs(
         rng, [300, 420, 900, 350, 280, 610, 380], [True, False, False, True, True, False, True]
     )
     after = verdict.random_runs(rng, [100, 110, 95, 120, 100, 90, 105], [True] * 7)
-    verdict.compare_validation(student.validate, before, after, ("speedup", "interval"))
+    verdict.compare_validation(student, before, after, ("speedup", "interval"))
 
 
 @suite.test("validate", points=1, name="success before and after", reread="Exercise 5.1")
-def validate_success(student: Any) -> None:
-    rng = np.random.default_rng(4)
-    before = verdict.random_runs(rng, [300.0] * 8, [True, False, False, True, True, False, True, False])
-    after = verdict.random_runs(rng, [100.0] * 8, [True] * 8)
-    verdict.compare_validation(student.validate, before, after, ("before", "after"))
+def validate_success(student: Student) -> None:
+    rng = student.rng("success")
+    worlds, won = int(rng.integers(7, 14)), int(rng.integers(2, 6))
+    wins = [k < won for k in rng.permutation(worlds)]
+    before = verdict.random_runs(rng, [300.0] * worlds, wins)
+    after = verdict.random_runs(rng, [100.0] * worlds, [True] * worlds)
+    verdict.compare_validation(student, before, after, ("before", "after"))
 
 
 @suite.test("validate", points=2, name="a clear case", reread="Exercise 5.1")
-def validate_clear(student: Any) -> None:
-    rng = np.random.default_rng(5)
-    before = verdict.random_runs(rng, [300.0] * 8, [True, False, False, True, False, False, True, False])
-    after = verdict.random_runs(rng, [100.0] * 8, [True] * 8)
-    verdict.compare_validation(student.validate, before, after, ("accept",))
+def validate_clear(student: Student) -> None:
+    rng = student.rng("clear")
+    wins = [True, False, False, True, False, False, True, False]
+    slow = verdict.random_runs(rng, [300.0] * 8, wins)
+    quick = verdict.random_runs(rng, [100.0] * 8, [True] * 8)
+    # Better, and the other way round: who accepts everything, or nothing, has not decided anything.
+    for better in rng.permutation([True, True, False]):
+        pair = (slow, quick) if better else (quick, slow)
+        verdict.compare_validation(student, *pair, ("accept",))

@@ -1,146 +1,59 @@
-"""How the tests of `hw3_performance` try a student's planner and repaired brain out."""
+"""How the tests of `hw3_performance` try a student's planner and repaired brain out.
+
+The brain that drives is the course's own, deployed as the student's ``repair`` says; only their planner runs where
+their code does. A run without it depends on the deployment alone, so it is made once (:func:`driven`).
+"""
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robotbrain.grading import expect, fail
+from robotbrain.grading.suites.hw3_performance_probes import describe_repair, host_repaired
 from robotbrain.grading.suites.hw3_performance_verdict import p95
+from robotbrain.grading.suites.planner_bench import (
+    RADIUS,
+    Array,
+    PlannerBench,
+    Point,
+    Room,
+    approach,
+    clearance,
+    walled_room,
+)
 
 if TYPE_CHECKING:
+    from robotbrain.grading import Student
     from robotbrain.pipeline.brain import RunResult
     from robotbrain.pipeline.inherited import BrainSetup
     from robotbrain.sim import World
 
-Array = NDArray[np.float64]
-Room = tuple[NDArray[np.int8], float, tuple[float, float]]
+NANO, NX = "orin-nano-8gb:15W", "xavier-nx:15W"
 
-RADIUS = 0.22
-"""What the planner keeps from the centre of an occupied cell, m."""
-
-BUDGET_MS = {"orin-nano-8gb:15W": 130.0, "xavier-nx:15W": 180.0}
+BUDGET_MS = {NANO: 130.0, NX: 180.0}
 """End-to-end latency that a repaired brain may have at the 95th percentile, by module, ms."""
 
+TIME_LIMIT = 10.0
+"""Of a drive in an easy world, s; a repaired brain takes half of it."""
 
-class CountedWork:
-    """A cost model in which work is free, but counted."""
-
-    def __init__(self) -> None:
-        self.units: dict[str, float] = {}
-
-    def cost(self, node_name: str, kind: str, name: str) -> int:
-        """Nothing costs anything."""
-        return 0
-
-    def work_ns(self, kind: str, units: float) -> int:
-        """Count work of a callback."""
-        self.units[kind] = self.units.get(kind, 0.0) + units
-        return 0
+SLOWEST_PLAN_MS = 500.0
+"""Time that one answer of a planner may take on the module: longer, and the robot waits for its path."""
 
 
-def open_room() -> Room:
-    """Return occupancy, resolution and origin of an empty 4 x 3 m room."""
-    occupancy = np.zeros((60, 80), dtype=np.int8)
-    occupancy[[0, -1], :] = occupancy[:, [0, -1]] = 100
-    return occupancy, 0.05, (-2.0, -1.5)
-
-
-def walled_room() -> Room:
-    """Return the same with a wall across most of it; the way around is at small y."""
-    occupancy, resolution, origin = open_room()
-    occupancy[22:, 39:41] = 100
-    return occupancy, resolution, origin
-
-
-def with_box(room: Room, x: float, y: float, half: float = 0.12) -> Room:
-    """Return a room with one more box."""
-    occupancy, resolution, origin = room[0].copy(), room[1], room[2]
-    columns = slice(int((x - half - origin[0]) / resolution), int((x + half - origin[0]) / resolution) + 1)
-    rows = slice(int((y - half - origin[1]) / resolution), int((y + half - origin[1]) / resolution) + 1)
-    occupancy[rows, columns] = 100
-    return occupancy, resolution, origin
-
-
-class Bench:
-    """A student's planner node beside a client, in simulated time.
-
-    Args:
-        make: makes the node.
-    """
-
-    def __init__(self, make: Callable[[], Any]) -> None:
-        from robotbrain.ros import SimContext  # first: it makes the imports below resolve
-
-        from nav_msgs.msg import OccupancyGrid  # isort: skip
-        from nav_msgs.srv import GetPlan  # isort: skip
-        from rclpy.node import Node  # isort: skip
-        from rclpy.qos import DurabilityPolicy, QoSProfile  # isort: skip
-
-        self.work = CountedWork()
-        self._context = SimContext(cost_model=self.work)
-        self._request: Callable[[], Any] = GetPlan.Request
-        with self._context.as_default():
-            make()
-            tester = Node("tester")
-            latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-            self._maps = tester.create_publisher(OccupancyGrid, "map", latched)
-            self._client = tester.create_client(GetPlan, "plan")
-        expect(self._client.service_is_ready(), "the node offers no service called `plan`", hint="return-response")
-
-    def show(self, room: Room) -> None:
-        """Publish a map."""
-        from robotbrain.ros.conversions import numpy_to_grid
-
-        self._maps.publish(numpy_to_grid(*room))
-        self._run(0.1)
-
-    def ask(self, start: tuple[float, float], goal: tuple[float, float], tolerance: float = 0.3) -> Array:
-        """Return the answered path, (N, 2) m; ``work.units`` then holds what the answer alone was charged."""
-        from robotbrain.ros.conversions import path_to_numpy
-
-        self.work.units.clear()
-        request = self._request()
-        request.start.pose.position.x, request.start.pose.position.y = start
-        request.goal.pose.position.x, request.goal.pose.position.y = goal
-        request.tolerance = tolerance
-        future = self._client.call_async(request)
-        self._run(1.0)
-        expect(future.done(), "the service did not answer", hint="return-response")
-        return path_to_numpy(future.result().plan)
-
-    def _run(self, seconds: float) -> None:
-        try:
-            self._context.run_for(seconds)
-        except Exception as error:
-            cause = error.__cause__ or error
-            if isinstance(cause, NotImplementedError):
-                raise cause from None
-            stuck = "empty-when-stuck" if "NoneType" in str(cause) else ""
-            hint = "return-response" if "must return" in str(cause) else stuck
-            fail(f"a callback of the node raised {type(cause).__name__}: {cause}", hint=hint)
-
-
-def clearance(points: Array, room: Room) -> float:
-    """Return the distance from a path to the nearest centre of an occupied cell, m."""
-    from robotbrain.pipeline.planning import resample
-
-    occupancy, resolution, origin = room
-    centres = np.asarray(origin) + (np.argwhere(occupancy >= 65)[:, ::-1] + 0.5) * resolution
-    dense = resample(points, resolution / 2)
-    return float(np.sqrt(((dense[:, None] - centres[None]) ** 2).sum(axis=2)).min())
+# ---------------------------------------------------------------- the planner
 
 
 def check_path(
     points: Array,
     room: Room,
-    start: tuple[float, float],
-    goal: tuple[float, float],
+    start: Point,
+    goal: Point,
     *,
     hint: str = "check-the-rest",
     near: float = 0.3,
@@ -175,7 +88,7 @@ def check_path(
     )
     room_left = clearance(points, room)
     expect(
-        room_left > RADIUS - 0.03,
+        room_left > RADIUS - 0.75 * room[1],  # a path is checked by the cells that it crosses, not by its points
         "the path leads through an obstacle, or scrapes along it",
         got=f"{room_left:.2f} m to an occupied cell",
         expected=f"more than {RADIUS:g} m",
@@ -194,27 +107,42 @@ def share_kept(points: Array, earlier: Array) -> float:
     return float((gaps < 2e-3).mean()) if len(rest) else 0.0
 
 
-# ---------------------------------------------------------------- the repaired brain
-
-_RUNS: dict[tuple[Any, ...], RunResult] = {}
+# ---------------------------------------------------------------- the repair
 
 
-def repaired(student: Any, module: str = "") -> BrainSetup:
+@dataclass(frozen=True)
+class Repair:
+    """A repaired brain: its setup with a planner of the kit's, and whether a student's own belongs in its place."""
+
+    setup: BrainSetup
+    own_planner: bool
+
+
+def repaired(student: Student, module: str = "") -> Repair:
     """Return what the student's ``repair`` makes of the inherited brain (on another module)."""
-    from robotbrain.pipeline.inherited import BrainSetup, inherited_brain
+    from robotbrain.pipeline.deployment import Deployment
+    from robotbrain.pipeline.inherited import BrainSetup, cropped_planner, whole_map_planner
 
-    given = inherited_brain()
-    if module:
-        given = replace(given, module=module)
-    answer: object = student.repair(given)
-    if not isinstance(answer, BrainSetup):
+    student["repair"]  # a function that is missing is reported before anything else
+    answer = student.run(describe_repair, module)
+    if not isinstance(answer, Mapping):
         wanted = "a BrainSetup, made with dataclasses.replace"
-        fail("`repair` should return a BrainSetup", got=type(answer).__name__, expected=wanted)
-        raise AssertionError  # `fail` has raised already
-    return answer
+        fail("`repair` should return a BrainSetup", got=str(answer), expected=wanted)
+    kits: Mapping[str, Callable[[], Any]] = {"whole_map_planner": whole_map_planner}
+    given = dict(answer["deployment"])
+    if isinstance(given["image_size"], list):
+        given["image_size"] = tuple(given["image_size"])
+    setup = BrainSetup(
+        module=str(answer["module"]),
+        deployment=Deployment(**given),
+        planner=kits.get(answer["planner"], cropped_planner),
+        replan_after=answer["replan_after"],
+    )
+    return Repair(setup, answer["planner"] == "")
 
 
-def easy_world(seed: int, distance: float = 1.6) -> World:
+@functools.cache
+def easy_world(seed: int, distance: float = 1.2) -> World:
     """Return an almost empty world in which the robot starts ``distance`` m from the marker and half turned to it."""
     from robotbrain.sim import Pose2D, generate_world
 
@@ -225,25 +153,145 @@ def easy_world(seed: int, distance: float = 1.6) -> World:
     return replace(world, start=Pose2D(x, y, math.atan2(goal.y - y, goal.x - x) + 0.4))
 
 
-def drive_repaired(student: Any, world: int, module: str = "", time_limit: float = 15.0) -> RunResult:
-    """Return a run of the student's repaired brain in an easy world, driven once for all tests that look at it."""
+@dataclass(frozen=True)
+class Drive:
+    """What a test wants to know of a run.
+
+    Attributes:
+        success, reason: as in RunResult.
+        e2e_p95_ms: 95th percentile of the end-to-end latency; inf if no command was ever built on an image.
+        image_p95_ms: 95th percentile of the time from an image to its segmentation; inf without any.
+    """
+
+    success: bool
+    reason: str
+    e2e_p95_ms: float
+    image_p95_ms: float
+
+    @classmethod
+    def of(cls, run: RunResult) -> Drive:
+        """Return it for a run."""
+        image = float(np.percentile(run.perception_ms, 95)) if len(run.perception_ms) else math.inf
+        return cls(run.success, run.reason, p95(run), image)
+
+
+Key = tuple[str | int | float | bool | None, ...]
+KNOWN: dict[Key, Drive] = {}
+"""Runs that were made before, by :func:`key_of`: while grading, those of the likely repairs."""
+
+
+def key_of(setup: BrainSetup, world: int, time_limit: float) -> Key | None:
+    """Return all that a run depends on, as plain values; None where that is more than the known runs differ in."""
+    from robotbrain.pipeline.inherited import inherited_brain
+
+    deployed, given = setup.deployment, inherited_brain().deployment
+    unusual = (deployed.network, deployed.scan_rays) != (given.network, given.scan_rays) or deployed.image_size is None
+    name = getattr(setup.planner, "__name__", "")
+    if unusual or name not in ("whole_map_planner", "cropped_planner"):
+        return None
+    return (
+        setup.module,
+        *(deployed.image_size or ()),
+        deployed.precision,
+        deployed.camera_queue,
+        deployed.one_thread,
+        name,
+        setup.replan_after,
+        world,
+        time_limit,
+    )
+
+
+def driven(setup: BrainSetup, world: int, time_limit: float = TIME_LIMIT) -> Drive:
+    """Return a run of a brain with a planner of the kit's in an easy world; runs are deterministic."""
+    key = key_of(setup, world, time_limit)
+    known = None if key is None else KNOWN.get(key)
+    return known or _driven(setup, world, time_limit)
+
+
+@functools.lru_cache(maxsize=64)
+def _driven(setup: BrainSetup, world: int, time_limit: float) -> Drive:
+    return Drive.of(setup.drive(easy_world(world), time_limit=time_limit))
+
+
+def drive_repaired(student: Student, world: int, module: str = "", time_limit: float = TIME_LIMIT) -> Drive:
+    """Return a run of the student's repaired brain in an easy world.
+
+    A planner that has a thread of its own delays neither perception nor control, so the kit's may drive in its place
+    (:func:`check_planner` tries the student's). On one thread with all others it has to come along.
+    """
     from robotbrain.ros import CallbackError
 
-    planner = student["ReusingPlanner"] if student.has("ReusingPlanner") else None
-    key = (student.repair, planner, world, module, time_limit)
-    if key not in _RUNS:
-        setup = repaired(student, module)
-        try:
-            _RUNS[key] = setup.drive(easy_world(world), time_limit=time_limit)
-        except CallbackError as error:
-            fail(f"a node raised {type(error.cause).__name__} on the way: {error.cause}")
-    return _RUNS[key]
+    repair = repaired(student, module)
+    if not (repair.own_planner and repair.setup.deployment.one_thread):
+        return driven(repair.setup, world, time_limit)
+    hosted = student.run(host_repaired, module)
+    setup = replace(repair.setup, planner=lambda: relay(hosted))
+    try:
+        return Drive.of(setup.drive(easy_world(world), time_limit=time_limit))
+    except CallbackError as error:
+        fail(f"the planner raised {getattr(error.cause, 'type_name', type(error.cause).__name__)} on the way")
+        raise
 
 
-def check_latency(run: RunResult, module: str) -> None:
+def relay(hosted: Any) -> Any:
+    """Return a planner node that hands maps and requests to a :class:`PlannerHost` and charges what it charges."""
+    from robotbrain.ros import SimContext  # noqa: F401 - first: it makes the imports below resolve
+
+    from nav_msgs.msg import OccupancyGrid  # isort: skip
+    from nav_msgs.srv import GetPlan  # isort: skip
+    from rclpy.node import Node  # isort: skip
+    from rclpy.qos import DurabilityPolicy, QoSProfile  # isort: skip
+
+    from robotbrain.ros.conversions import grid_to_numpy, numpy_to_path
+
+    class Relay(Node):  # type: ignore[misc]
+        def __init__(self) -> None:
+            super().__init__("planner")
+            latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+            self.create_subscription(OccupancyGrid, "map", self.on_map, latched)
+            self.create_service(GetPlan, "plan", self.plan)
+
+        def charge(self, work: Mapping[str, float]) -> None:
+            for kind, units in work.items():
+                self.context.charge_work(str(kind), float(units))
+
+        def on_map(self, message: Any) -> None:
+            grid = grid_to_numpy(message)
+            self.charge(hosted.show(grid.cells, grid.resolution, grid.origin[:2]))
+
+        def plan(self, request: Any, response: Any) -> Any:
+            start, goal = ((p.pose.position.x, p.pose.position.y) for p in (request.start, request.goal))
+            points, work = hosted.ask(start, goal, float(request.tolerance))
+            self.charge(work)
+            if points is not None and len(points):
+                response.plan = numpy_to_path(points, stamp=self.get_clock().now().to_msg())
+            return response
+
+    return Relay()
+
+
+def check_planner(student: Student, module: str, rng: np.random.Generator) -> None:
+    """Let a robot drive by the planner of the repaired brain, if it is the student's own, and time its answers."""
+    from robotbrain.jetson import load_profile
+
+    if not repaired(student, module).own_planner:
+        return
+    bench = PlannerBench(student.run(host_repaired, module))
+    start, goal = ((side * float(rng.uniform(0.8, 1.2)), float(rng.uniform(-0.2, 0.4))) for side in (-1, 1))
+    room = walled_room(gap=float(rng.uniform(-0.6, -0.4)))
+    wrong = approach(bench, room, start, goal)
+    expect(not wrong, f"with your planner the robot {wrong}", hint="measure-again")
+    profile = load_profile(module or NANO)
+    slowest = sum(profile.work_ns(kind, units) for kind, units in bench.most_work.items()) / 1e6
+    expect(slowest <= SLOWEST_PLAN_MS, "your planner takes too long", got=f"{slowest:.0f} ms", hint="measure-again",
+           expected=f"at most {SLOWEST_PLAN_MS:g} ms for an answer")  # fmt: skip
+
+
+def check_latency(run: Drive, module: str) -> None:
     """Check the end-to-end latency against the module's budget; half the points for up to half as much again."""
     budget = BUDGET_MS[module]
-    latency = p95(run)
+    latency = run.e2e_p95_ms
     shown = "no command was ever built on an image" if latency == math.inf else f"{latency:.0f} ms"
     expect(
         latency <= budget,

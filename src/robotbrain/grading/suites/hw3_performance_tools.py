@@ -14,10 +14,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robotbrain.grading import expect, expect_close, fail
-from robotbrain.grading.suites.hw3_performance_traces import MS
+from robotbrain.grading import expect, fail
+from robotbrain.grading.suites import judging
+from robotbrain.grading.suites.hw3_performance_traces import MS, hand_over
 
 if TYPE_CHECKING:
+    from robotbrain.grading import Student
     from robotbrain.monitoring.trace import Trace
     from robotbrain.ros.context import CallbackRecord
 
@@ -27,19 +29,6 @@ POINTS, IMAGE, COMMAND = "/perception/points", "/camera/image", "/cmd_vel"
 CONTROLLER, PERCEPTION = "/controller", "/perception"
 FOLLOW = {CONTROLLER: POINTS}
 """Which input to follow back from a timer of a node."""
-
-
-def first_match(answer: Any, mistakes: Sequence[tuple[str, Any]], atol: float = 1e-6) -> str:
-    """Return the hint of the first mistake that gives ``answer``, or ''."""
-    try:
-        given = np.asarray(answer, dtype=float)
-    except (TypeError, ValueError):
-        return ""
-    for hint, wrong in mistakes:
-        expected = np.asarray(wrong, dtype=float)
-        if expected.shape == given.shape and np.allclose(given, expected, atol=atol, rtol=1e-6, equal_nan=True):
-            return hint
-    return ""
 
 
 def numbers(answer: Any, what: str, count: int) -> list[float]:
@@ -82,40 +71,40 @@ def _takes(trace: Trace) -> list[CallbackRecord]:
     return [c for c in trace.callbacks if c.node == CONTROLLER and c.kind == "subscription" and c.name == POINTS]
 
 
-def compare_ages(student: Callable[..., Any], trace: Trace, given: str) -> None:
+def compare_ages(student: Student, trace: Trace, given: str) -> None:
     """Compare with the oracle."""
     expected = ages(trace)
-    released = {c.end_ns: trace.message_by_id[c.message].released_ns for c in _takes(trace)}
-    first = min((trace.stamps[c.message] for c in _takes(trace)), default=0)
-    controls = [c for c in trace.callbacks if c.node == CONTROLLER and c.kind == "timer"]
-    mistakes = [
-        ("ns-to-ms", expected * MS),
-        ("ns-to-ms", expected * 1e3),
-        ("ns-to-ms", expected * 1e-3),
-        ("stamp-is-the-truth", ages(trace, lambda known: released[known[-1][0]])),
-        ("stamp-is-the-truth", ages(trace, lambda known: known[-1][0])),
-        ("newest-input", ages(trace, lambda known: known[0][1])),
-        ("newest-input", ages(trace, lambda known: first)),
-        ("leaves-at-the-end", ages(trace, at=lambda control: control.start_ns)),
-        ("leaves-at-the-end", ages(trace, at=lambda control: control.ready_ns)),
-        ("taken-before-start", ages(trace, until=lambda control: control.end_ns)),
-        ("callback-is-not-latency", [(c.end_ns - c.start_ns) / MS for c in controls]),
-        ("callback-is-not-latency", [(c.end_ns - c.start_ns) / MS for c in controls][-len(expected) :]),
-        ("callback-is-not-latency", [(c.end_ns - c.ready_ns) / MS for c in controls]),
-    ]
-    answer = student(trace)
-    hint = first_match(answer, mistakes)
-    try:
-        if not hint and np.size(answer) > len(expected):
-            hint = "no-input-no-age"
-    except (TypeError, ValueError):
-        pass
-    expect_close(answer, expected, atol=1e-6, given=given, hint=hint, what="the list of ages")
+    answer = student.command_ages_ms(hand_over(student, trace))
+    numbers = judging.as_numbers(answer)
+    longer = numbers is not None and numbers.size > len(expected)
+
+    def mistakes() -> list[tuple[str, Any]]:
+        released = {c.end_ns: trace.message_by_id[c.message].released_ns for c in _takes(trace)}
+        first = min((trace.stamps[c.message] for c in _takes(trace)), default=0)
+        controls = [c for c in trace.callbacks if c.node == CONTROLLER and c.kind == "timer"]
+        return [
+            ("ns-to-ms", expected * MS),
+            ("ns-to-ms", expected * 1e3),
+            ("ns-to-ms", expected * 1e-3),
+            ("stamp-is-the-truth", ages(trace, lambda known: released[known[-1][0]])),
+            ("stamp-is-the-truth", ages(trace, lambda known: known[-1][0])),
+            ("newest-input", ages(trace, lambda known: known[0][1])),
+            ("newest-input", ages(trace, lambda known: first)),
+            ("leaves-at-the-end", ages(trace, at=lambda control: control.start_ns)),
+            ("leaves-at-the-end", ages(trace, at=lambda control: control.ready_ns)),
+            ("taken-before-start", ages(trace, until=lambda control: control.end_ns)),
+            ("callback-is-not-latency", [(c.end_ns - c.start_ns) / MS for c in controls]),
+            ("callback-is-not-latency", [(c.end_ns - c.start_ns) / MS for c in controls][-len(expected) :]),
+            ("callback-is-not-latency", [(c.end_ns - c.ready_ns) / MS for c in controls]),
+        ]
+
+    hint = "no-input-no-age" if longer else ""
+    judging.compare(answer, expected, mistakes, given=given, hint=hint, what="the list of ages")
 
 
-def compare_summary(student: Callable[..., Any], values: Sequence[float]) -> None:
+def compare_summary(student: Student, values: Sequence[float]) -> None:
     """Compare with NumPy's percentiles."""
-    answer = student(np.array(values, dtype=float))
+    answer = student.summarise(np.array(values, dtype=float))
     keys = ("n", "p50", "p95", "p99")
     if not isinstance(answer, Mapping) or not set(keys) <= set(answer):
         fail("the answer is not the dict asked for", got=answer, expected=f"a dict with the keys {', '.join(keys)}")
@@ -125,13 +114,15 @@ def compare_summary(student: Callable[..., Any], values: Sequence[float]) -> Non
         numb = all(isinstance(answer[k], float) and math.isnan(answer[k]) for k in keys[1:])
         expect(numb, "percentiles of nothing", got=answer, expected="NaN, not a number", hint="nothing-is-nan")
         return
-    for key in keys[1:]:
-        quantile = float(np.percentile(values, float(key[1:])))
-        wrong = [("percentile-not-mean", np.mean(values)), ("percentile-not-mean", np.mean(values) + np.std(values))]
-        wrong += [("percentile-not-mean", np.mean(values) + z * np.std(values)) for z in (1.645, 2.0, 2.326)]
-        wrong += [("quantile-or-percent", np.percentile(values, float(key[1:]) / 100))]
-        hint = first_match(answer[key], wrong)
-        expect_close(answer[key], quantile, rtol=1e-6, given=given, hint=hint, what=key)
+    for key, quantile in zip(keys[1:], np.percentile(values, [50, 95, 99]), strict=True):
+        percent = float(key[1:])
+
+        def mistakes(percent: float = percent) -> list[tuple[str, float]]:
+            mean, spread = float(np.mean(values)), float(np.std(values))
+            wrong = [("percentile-not-mean", mean + z * spread) for z in (0.0, 1.0, 1.645, 2.0, 2.326)]
+            return [*wrong, ("quantile-or-percent", float(np.percentile(values, percent / 100)))]
+
+        judging.compare(answer[key], float(quantile), mistakes, given=given, what=key)
 
 
 def misses(trace: Trace, deadline_ms: float, topic: str = IMAGE, node: str = PERCEPTION) -> tuple[int, int]:
@@ -142,68 +133,63 @@ def misses(trace: Trace, deadline_ms: float, topic: str = IMAGE, node: str = PER
     return len(late), len(due)
 
 
-def compare_misses(student: Callable[..., Any], trace: Trace, deadline_ms: float, given: str) -> None:
+def compare_misses(student: Student, trace: Trace, deadline_ms: float, given: str) -> None:
     """Compare with the oracle."""
     expected = misses(trace, deadline_ms)
+    answer = student.deadline_misses(hand_over(student, trace), IMAGE, PERCEPTION, deadline_ms)
+    late, due = numbers(answer, "(missed, due)", 2)
+    if [late, due] == list(expected):
+        return
     done = [c for c in trace.callbacks if c.node == PERCEPTION and c.name == IMAGE]
     limit = deadline_ms * MS
     sent = [m for m in trace.messages if m.name == IMAGE]
     gone = sum(count for place, count in trace.dropped.items() if place == (PERCEPTION, IMAGE))
-    slow_from = {"start": sum(c.end_ns - c.start_ns > limit for c in done)}
-    slow_from["ready"] = sum(c.end_ns - c.ready_ns > limit for c in done)
+    from_start = sum(c.end_ns - c.start_ns > limit for c in done)
+    from_ready = sum(c.end_ns - c.ready_ns > limit for c in done)
     strict = sum(c.end_ns - c.ready_ns >= limit for c in done)
     never = len(sent) - len(done)
     mistakes = [
-        ("lost-is-late", (slow_from["ready"], len(done))),
-        ("lost-is-late", (slow_from["ready"], expected[1])),
-        ("from-ready-on", (slow_from["start"], len(done))),
-        ("from-ready-on", (slow_from["start"] + never, len(sent))),
-        ("from-ready-on", (slow_from["start"] + never, expected[1])),
-        ("from-ready-on", (slow_from["start"] + expected[1] - len(done), expected[1])),
-        ("waiting-is-late", (slow_from["ready"] + gone, len(done) + gone)),
-        ("waiting-is-late", (slow_from["ready"] + gone, expected[1])),
-        ("not-due-yet", (slow_from["ready"] + never, len(sent))),
-        ("just-in-time", (strict + expected[0] - slow_from["ready"], expected[1])),
+        ("lost-is-late", (from_ready, len(done))),
+        ("lost-is-late", (from_ready, expected[1])),
+        ("from-ready-on", (from_start, len(done))),
+        ("from-ready-on", (from_start + never, len(sent))),
+        ("from-ready-on", (from_start + never, expected[1])),
+        ("from-ready-on", (from_start + expected[1] - len(done), expected[1])),
+        ("waiting-is-late", (from_ready + gone, len(done) + gone)),
+        ("waiting-is-late", (from_ready + gone, expected[1])),
+        ("not-due-yet", (from_ready + never, len(sent))),
+        ("just-in-time", (strict + expected[0] - from_ready, expected[1])),
         ("ns-to-ms", (len(done), expected[1])),
         ("ns-to-ms", (expected[1], expected[1])),
     ]
-    late, due = numbers(student(trace, IMAGE, PERCEPTION, deadline_ms), "(missed, due)", 2)
-    hint = first_match((late, due), [m for m in mistakes if m[1] != expected])
-    expect((late, due) == expected, "these are not the missed and the due", got=(late, due), expected=expected,
-           given=given, hint=hint)  # fmt: skip
+    hint = judging.first_match((late, due), mistakes, expected)
+    fail("these are not the missed and the due", got=(late, due), expected=expected, given=given, hint=hint)
 
 
-def compare_rhythm(student: Callable[..., Any], trace: Trace, period_ms: float, given: str) -> None:
+def compare_rhythm(student: Student, trace: Trace, period_ms: float, given: str) -> None:
     """Compare with the closed form."""
     calls = [c for c in trace.callbacks if c.node == CONTROLLER and c.kind == "timer"]
     starts = np.array([c.start_ns for c in calls]) / MS
     gaps = np.diff(starts)
-    drift = (gaps.mean() / period_ms - 1) * 1e3
-    expected = (float(gaps.std()), float(drift))
-    queued = np.array([c.queued_ns for c in calls]) / MS
-    lengths = np.array([c.end_ns - c.start_ns for c in calls]) / MS
-    jitters = [
-        ("spread-of-intervals", starts.std()),
-        ("spread-of-intervals", (starts - starts.mean()).std()),
-        ("spread-of-intervals", gaps.mean()),
-        ("spread-of-intervals", gaps.var()),
-        ("spread-of-intervals", lengths.std()),
-        ("spread-of-intervals", np.diff(np.array([c.end_ns for c in calls]) / MS).std()),
-        ("spread-of-intervals", queued.std()),
-        ("ns-to-ms", expected[0] * MS),
-        ("ns-to-ms", expected[0] * 1e-3),
-    ]
-    drifts = [
-        ("drift-per-second", gaps.mean() - period_ms),
-        ("drift-per-second", gaps.mean() / period_ms - 1),
-        ("drift-per-second", starts[-1] - starts[0] - (len(starts) - 1) * period_ms),
-        ("late-is-positive", -drift),
-    ]
-    jitter, lost = numbers(student(trace, CONTROLLER, "_control", period_ms), "(jitter_ms, drift_ms_per_s)", 2)
-    hint = first_match(jitter, [m for m in jitters if not np.isclose(m[1], expected[0])], atol=1e-9)
-    expect_close(jitter, expected[0], atol=1e-6, given=given, hint=hint, what="the jitter")
-    hint = first_match(lost, [m for m in drifts if not np.isclose(m[1], expected[1])], atol=1e-9)
-    expect_close(lost, expected[1], atol=1e-6, given=given, hint=hint, what="the drift")
+    spread, drift = float(gaps.std()), float((gaps.mean() / period_ms - 1) * 1e3)
+    answer = student.timer_rhythm(hand_over(student, trace), CONTROLLER, "_control", period_ms)
+    jitter, lost = numbers(answer, "(jitter_ms, drift_ms_per_s)", 2)
+
+    def jitters() -> list[tuple[str, Any]]:
+        ends, queued = (np.array([getattr(c, name) for c in calls]) / MS for name in ("end_ns", "queued_ns"))
+        own = (starts.std(), gaps.mean(), gaps.var(), (ends - starts).std(), np.diff(ends).std(), queued.std())
+        return [("spread-of-intervals", v) for v in own] + [("ns-to-ms", spread * MS), ("ns-to-ms", spread * 1e-3)]
+
+    def drifts() -> list[tuple[str, Any]]:
+        return [
+            ("drift-per-second", gaps.mean() - period_ms),
+            ("drift-per-second", gaps.mean() / period_ms - 1),
+            ("drift-per-second", starts[-1] - starts[0] - (len(starts) - 1) * period_ms),
+            ("late-is-positive", -drift),
+        ]
+
+    judging.compare(jitter, spread, jitters, match_atol=1e-9, given=given, what="the jitter")
+    judging.compare(lost, drift, drifts, match_atol=1e-9, given=given, what="the drift")
 
 
 # ---------------------------------------------------------------- Part 2: identify
@@ -228,10 +214,10 @@ def thread_use(trace: Trace) -> dict[tuple[int, int], float]:
     return {place: length / (trace.end_ns - trace.start_ns) for place, length in spent.items()}
 
 
-def compare_utilisation(student: Callable[..., Any], trace: Trace, given: str) -> None:
+def compare_utilisation(student: Student, trace: Trace, given: str) -> None:
     """Compare both dicts with the oracles."""
     resources, threads = resource_use(trace), thread_use(trace)
-    answer = student(trace)
+    answer = student.utilisation(hand_over(student, trace))
     if not (isinstance(answer, tuple) and len(answer) == 2 and all(isinstance(part, Mapping) for part in answer)):
         fail("the answer should be two dicts", got=answer, expected="(resources, threads)")
     got_resources, got_threads = dict(answer[0]), dict(answer[1])
@@ -244,20 +230,28 @@ def compare_utilisation(student: Callable[..., Any], trace: Trace, given: str) -
         expected=sorted(resources),
         hint="idle-is-zero" if idle else "",
     )
-    cpu_wall = sum(c.end_ns - c.start_ns for c in trace.callbacks) / (trace.end_ns - trace.start_ns)
-    length = max(c.end_ns for c in trace.callbacks) - min(c.start_ns for c in trace.callbacks)
-    stretch = (trace.end_ns - trace.start_ns) / length
+    whole = trace.end_ns - trace.start_ns
+
+    def stretched(share: float) -> tuple[str, float]:
+        length = max(c.end_ns for c in trace.callbacks) - min(c.start_ns for c in trace.callbacks)
+        return "whole-recording", share * whole / length
+
     for name, share in resources.items():
-        wrong = [
-            ("all-the-cores", share * trace.capacity[name]),
-            ("percent-or-share", 100 * share),
-            ("waiting-is-not-busy", cpu_wall),
-            ("waiting-is-not-busy", cpu_wall / trace.capacity[name]),
-            ("whole-recording", share * stretch),
-            ("ns-to-ms", share * 1e6),
-        ]
-        hint = first_match(got_resources[name], wrong, atol=1e-9) if share else ""
-        expect_close(got_resources[name], share, atol=1e-6, given=given, hint=hint, what=f"the share of {name}")
+
+        def wrong_resource(name: str = name, share: float = share) -> list[tuple[str, float]]:
+            held = sum(c.end_ns - c.start_ns for c in trace.callbacks) / whole
+            return [
+                ("all-the-cores", share * trace.capacity[name]),
+                ("percent-or-share", 100 * share),
+                ("waiting-is-not-busy", held),
+                ("waiting-is-not-busy", held / trace.capacity[name]),
+                stretched(share),
+                ("ns-to-ms", share * 1e6),
+            ]
+
+        judging.compare(
+            got_resources[name], share, wrong_resource, match_atol=1e-9, given=given, what=f"the share of {name}"
+        )
     expect(
         got_threads.keys() == threads.keys(),
         "the second dict should have each thread (executor, worker) that ran something",
@@ -265,22 +259,21 @@ def compare_utilisation(student: Callable[..., Any], trace: Trace, given: str) -
         expected=sorted(threads),
         hint="thread-is-a-pair",
     )
-    demands: dict[tuple[int, int], dict[str, int]] = {}
-    for callback in trace.callbacks:
-        spent = demands.setdefault((callback.executor, callback.worker), {"all": 0, "cpu": 0})
-        spent["all"] += callback.demand_ns
-        spent["cpu"] += sum(length for resource, length in callback.segments if resource == "cpu")
     for place, share in threads.items():
-        whole = trace.end_ns - trace.start_ns
-        wrong = [
-            ("thread-is-held", demands[place]["cpu"] / whole),
-            ("thread-is-held", demands[place]["all"] / whole),
-            ("all-the-cores", share / trace.capacity["cpu"]),
-            ("percent-or-share", 100 * share),
-            ("whole-recording", share * stretch),
-        ]
-        hint = first_match(got_threads[place], wrong, atol=1e-9) if share else ""
-        expect_close(got_threads[place], share, atol=1e-6, given=given, hint=hint, what=f"the share of thread {place}")
+
+        def wrong_thread(place: tuple[int, int] = place, share: float = share) -> list[tuple[str, float]]:
+            calls = [c for c in trace.callbacks if (c.executor, c.worker) == place]
+            on_cpu = sum(length for c in calls for resource, length in c.segments if resource == "cpu")
+            return [
+                ("thread-is-held", on_cpu / whole),
+                ("thread-is-held", sum(c.demand_ns for c in calls) / whole),
+                ("all-the-cores", share / trace.capacity["cpu"]),
+                ("percent-or-share", 100 * share),
+                stretched(share),
+            ]
+
+        what = f"the share of thread {place}"
+        judging.compare(got_threads[place], share, wrong_thread, match_atol=1e-9, given=given, what=what)
 
 
 def chain(trace: Trace, message: int, newest: bool = True, through_timers: bool = True) -> list[int]:
@@ -304,29 +297,30 @@ def chain(trace: Trace, message: int, newest: bool = True, through_timers: bool 
     return found[::-1]
 
 
-def compare_chains(student: Callable[..., Any], trace: Trace, commands: Sequence[int], given: str) -> None:
+def compare_chains(student: Student, trace: Trace, commands: Sequence[int], given: str) -> None:
     """Compare the chains behind some commands with the oracle's."""
+    theirs = hand_over(student, trace)
     for message in commands:
         expected = chain(trace, message)
-        answer = student(trace, message, dict(FOLLOW))
+        answer = student.causal_chain(theirs, message, dict(FOLLOW))
         try:
             got = [callback.id for callback in answer]
         except (TypeError, AttributeError):
             fail("the answer should be a list of callback records", got=answer, expected="[CallbackRecord, ...]")
+        if got == expected:
+            continue
         mistakes = {
             "timers-have-inputs": [chain(trace, message, through_timers=False)],
             "newest-input": [chain(trace, message, newest=False)],
             "sensor-first": [expected[::-1]],
             "both-callbacks": [expected[:-2] + expected[-1:]],
         }
-        hint = next((key for key, wrong in mistakes.items() if got in wrong and got != expected), "")
-        expect(
-            got == expected,
+        fail(
             f"this is not the chain behind command {message}",
             got=[_show(trace, number) for number in got],
             expected=[_show(trace, number) for number in expected],
             given=given,
-            hint=hint,
+            hint=next((key for key, wrong in mistakes.items() if got in wrong), ""),
         )
 
 
@@ -335,12 +329,12 @@ def _show(trace: Trace, number: int) -> str:
     return "?" if callback is None else f"{number} {callback.node} {callback.name}"
 
 
-def compare_budget(student: Callable[..., Any], links: list[CallbackRecord], given: str) -> None:
+def compare_budget(student: Student, links: list[CallbackRecord], given: str) -> None:
     """Compare with the closed form: waiting and working of each link after the first."""
     expected = [
         (b.node, (b.start_ns - a.end_ns) / MS, (b.end_ns - b.start_ns) / MS) for a, b in itertools.pairwise(links)
     ]
-    answer = student(list(links))
+    answer = student.latency_budget(list(links))
     try:
         rows = [(str(node), float(waiting), float(working)) for node, waiting, working in answer]
     except (TypeError, ValueError):
@@ -384,12 +378,12 @@ def bottleneck(trace: Trace, full: float = 0.9, main: float = 2 / 3) -> tuple[st
     return role, "gpu" if spent[role]["gpu"] > spent[role]["cpu"] else "cpu"
 
 
-def compare_bottleneck(student: Callable[..., Any], trace: Trace, expected: tuple[str, str], given: str) -> None:
+def compare_bottleneck(student: Student, trace: Trace, expected: tuple[str, str], given: str) -> None:
     """Compare with what was planted."""
-    answer = student(trace)
+    answer = student.find_bottleneck(hand_over(student, trace))
     if not (isinstance(answer, (tuple, list)) and len(answer) == 2):
         fail("the answer should be (role, cause)", got=answer, expected=expected)
-    got = (str(answer[0] or ""), str(answer[1]))
+    got = tuple("" if part is None else part for part in answer)
     if got == expected:
         return
     lengths: dict[str, list[int]] = {}
@@ -411,20 +405,20 @@ def compare_bottleneck(student: Callable[..., Any], trace: Trace, expected: tupl
         hint = "sharing-or-not"
     elif got[0] == expected[0]:
         hint = "where-the-time-goes"
-    expect(False, "this is not the bottleneck", got=got, expected=expected, given=given, hint=hint)
+    fail("this is not the bottleneck", got=got, expected=expected, given=given, hint=hint)
 
 
 # ---------------------------------------------------------------- Part 3: propose
 
 
-def compare_gain(student: Callable[..., Any], stages: Mapping[str, float], change: Mapping[str, float]) -> None:
+def compare_gain(student: Student, stages: Mapping[str, float], change: Mapping[str, float]) -> None:
     """Compare both gains, serial and pipelined, with the closed form."""
     after = {name: ms / change.get(name, 1.0) for name, ms in stages.items()}
     latency = sum(stages.values()) / sum(after.values())
     rate = max(stages.values()) / max(after.values())
     given = f"stages {dict(stages)} ms, speed-ups {dict(change)}"
     for pipelined in (False, True):
-        answer = student(dict(stages), dict(change), pipelined)
+        answer = student.predict_gain(dict(stages), dict(change), pipelined)
         if not isinstance(answer, Mapping) or not {"latency", "throughput"} <= set(answer):
             fail("the answer is not the dict asked for", got=answer, expected="keys latency and throughput")
         for key, expected in (("latency", latency), ("throughput", rate if pipelined else latency)):
@@ -433,12 +427,11 @@ def compare_gain(student: Callable[..., Any], stages: Mapping[str, float], chang
                 ("slowest-stage", latency if pipelined and key == "throughput" else rate),
                 ("gains-do-not-add", sum(change.values())),
                 ("gains-do-not-add", sum(change.values()) - len(change) + 1),
-                ("gains-do-not-add", np.prod(list(change.values()))),
-                ("gains-do-not-add", np.mean([change.get(name, 1.0) for name in stages])),
+                ("gains-do-not-add", math.prod(change.values())),
+                ("gains-do-not-add", sum(change.get(name, 1.0) for name in stages) / len(stages)),
             ]
-            hint = first_match(answer[key], [m for m in wrong if not np.isclose(m[1], expected)])
             where = f"{given}, {'pipelined' if pipelined else 'one after the other'}"
-            expect_close(answer[key], expected, atol=1e-9, given=where, hint=hint, what=f"the gain in {key}")
+            judging.compare(answer[key], expected, wrong, atol=1e-9, given=where, what=f"the gain in {key}")
 
 
 def service_ms(trace: Trace, node: str, name: str, resource: str, factor: float) -> float:
@@ -449,7 +442,7 @@ def service_ms(trace: Trace, node: str, name: str, resource: str, factor: float)
 
 
 def compare_prediction(
-    student: Callable[..., Any],
+    student: Student,
     trace: Trace,
     place: tuple[str, str],
     resource: str,
@@ -468,12 +461,11 @@ def compare_prediction(
         ("ns-to-ms", expected * MS),
         ("before-over-after", before / expected),
     ]
-    answer = student(trace, *place, resource, factor)
+    answer = student.predict_service_ms(hand_over(student, trace), *place, resource, factor)
     given = (
         f"{place[0]} {place[1]}: {before:.1f} ms, of which {bare:.1f} ms on the {resource}, made {factor:g} x faster"
     )
-    expect_close(
-        answer, expected, rtol=1e-3, given=given, hint=first_match(answer, mistakes), what="the predicted time"
-    )
+    judging.compare(answer, expected, mistakes, rtol=1e-3, given=given, what="the predicted time")
     if measured_ms is not None:
-        expect_close(answer, measured_ms, rtol=0.1, given=given, what="against the measured time, the predicted one")
+        what = "against the measured time, the predicted one"
+        judging.compare(answer, measured_ms, rtol=0.1, given=given, what=what)

@@ -6,8 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from robotbrain.grading import Suite, expect, expect_close
+from robotbrain.grading import Student, Suite, expect
+from robotbrain.grading.suites import judging
+from robotbrain.grading.suites import lab_integration_planning as plans
 from robotbrain.grading.suites import lab_integration_tools as tools
+from robotbrain.grading.suites.planner_bench import PlannerBench, open_room, walled_room
 
 suite = Suite("lab_integration")
 
@@ -31,7 +34,7 @@ suite.exercise("gap", title="5.1 The gap", points=8, provides=("paired_gap",))
 # Stand-ins for a student's part that is not right yet, so that what builds on it can still be graded.
 suite.reference("preprocess", "robotbrain.pipeline.segmentation:preprocess")
 suite.reference("back_project", "robotbrain.pipeline.segmentation:back_project")
-suite.reference("inflate", lambda: tools.inflate)
+suite.reference("inflate", lambda: plans.inflate)
 suite.reference("astar", "robotbrain.pipeline.planning:astar")
 suite.reference("smooth", "robotbrain.pipeline.planning:smooth")
 suite.reference("MyPlanner", "robotbrain.pipeline.nodes.planner:PlannerNode")
@@ -123,162 +126,192 @@ for _key, _text in _HINTS.items():
 
 
 @suite.test("preprocess", points=3, name="right values for a known image", reread="Exercise 1.1")
-def preprocess_values(student: Any) -> None:
-    tools.compare_preprocess(student.preprocess, tools.gradient_image(6, 5))
+def preprocess_values(student: Student) -> None:
+    tools.compare_preprocess(student, tools.image(student.rng("image"), 6, 5))
 
 
 @suite.test("preprocess", points=1, name="float32, as the network wants it", hint="float32", reread="Exercise 1.1")
-def preprocess_dtype(student: Any) -> None:
-    answer = np.asarray(student.preprocess(tools.gradient_image(6, 5)))
-    expect(answer.dtype == np.float32, "the dtype is not float32", got=str(answer.dtype), expected="float32")
+def preprocess_dtype(student: Student) -> None:
+    pixels = student.rng("dtype").integers(0, 256, (6, 5, 3), dtype=np.uint8)
+    answer = student.preprocess(pixels.copy())
+    dtype = str(getattr(answer, "dtype", "that of a plain list, float64")).removeprefix("torch.")
+    expect(dtype == "float32", "the dtype is not float32", got=dtype, expected="float32")
+    # Scaled somehow and put in any order, but the image's values: the other tests judge the rest.
+    numbers = judging.as_numbers(answer)
+    same = numbers is not None and numbers.size == pixels.size and np.ptp(numbers) > 0
+    expect(same and np.allclose(_spread(numbers), _spread(pixels), atol=1e-3), "these are not the image's 90 values")
+
+
+def _spread(values: Any) -> Any:
+    """The values in ascending order, moved and scaled to [0, 1]."""
+    return (np.sort(np.ravel(values)).astype(float) - np.min(values)) / float(np.ptp(values))
 
 
 @suite.test("back_project", points=2, name="the pixel on the optical axis", reread="Exercise 1.2")
-def back_project_axis(student: Any) -> None:
-    camera = tools.camera(pitch=0.3)
-    depth = np.full((5, 5), 2.0)
-    point = tools.points_of(student.back_project, depth, camera)[2, 2]
-    expected = (0.1 + 2 * np.cos(0.3), 0.0, 0.26 - 2 * np.sin(0.3))
-    flat = (0.1 + 2.0, 0.0, 0.26)
-    hint = "pitch-rotates" if np.allclose(point, flat, atol=1e-6) else ""
-    bare = np.subtract(expected, camera.position)
-    hint = "camera-position" if np.allclose(point, bare, atol=1e-6) else hint
-    expect_close(
-        point,
-        expected,
-        atol=1e-6,
-        given="depth 2 m everywhere, pixel (row 2, column 2) on the axis, pitch 0.3 rad",
-        hint=hint,
-    )
+def back_project_axis(student: Student) -> None:
+    pitch, far = (float(v) for v in student.rng("axis").uniform((0.2, 1.5), (0.5, 3.0)))
+    camera = tools.camera(pitch=pitch)
+    point = tools.points_of(student, np.full((5, 5), far), camera)[2, 2]
+    expected = (0.1 + far * np.cos(pitch), 0.0, 0.26 - far * np.sin(pitch))
+    mistakes = [
+        ("pitch-rotates", (0.1 + far, 0.0, 0.26)),
+        ("camera-position", np.subtract(expected, camera.position)),
+    ]
+    given = f"depth {far:.2f} m everywhere, pixel (row 2, column 2) on the axis, pitch {pitch:.2f} rad"
+    judging.compare(point, expected, mistakes, given=given)
 
 
 @suite.test("back_project", points=3, name="left stays left, on a level camera", reread="Exercise 1.2")
-def back_project_level(student: Any) -> None:
-    tools.compare_points(student.back_project, np.full((5, 5), 2.0), tools.camera(pitch=0.0))
+def back_project_level(student: Student) -> None:
+    far = float(student.rng("level").uniform(1.5, 3.0))
+    tools.compare_points(student, np.full((5, 5), far), tools.camera(pitch=0.0))
 
 
 @suite.test(
     "back_project", points=1, name="no depth, no point", hint="nan-without-depth", reread="Exercise 1.2, last paragraph"
 )
-def back_project_nan(student: Any) -> None:
+def back_project_nan(student: Student) -> None:
     depth = np.full((5, 5), 2.0)
-    depth[0, 1] = np.inf
-    points = tools.points_of(student.back_project, depth, tools.camera(pitch=0.2))
-    expect(np.isnan(points[0, 1]).all(), "a pixel without depth should be NaN", got=points[0, 1], expected="three NaN")
-    expect(np.isfinite(points[1:]).all(), "pixels with a depth should be finite", got=points[1:])
+    row, column = (int(k) for k in student.rng("nan").integers(5, size=2))
+    depth[row, column] = np.inf
+    points = tools.points_of(student, depth, tools.camera(pitch=0.2))
+    gone = points[row, column]
+    expect(np.isnan(gone).all(), "a pixel without depth should be NaN", got=gone, expected="three NaN")
+    expect(np.isfinite(points).sum() == 72, "pixels with a depth should be finite", got=points)
 
 
 @suite.test("deadline", points=2, name="a period of 100 ms", reread="Exercise 1.3")
-def deadline_simple(student: Any) -> None:
-    tools.compare_deadline(student.deadline_slack_ms, tools.profile(20.0, 5.0), 10.0)
+def deadline_simple(student: Student) -> None:
+    inference, cpu = (round(float(v), 1) for v in student.rng("deadline").uniform((10, 2), (30, 8)))
+    tools.compare_deadline(student, tools.profile(inference, cpu), 10.0)
 
 
 # ---------------------------------------------------------------- Part 2
 
 
 @suite.test("inflate", points=2, name="one obstacle in an open field", reread="Exercise 2.1")
-def inflate_point(student: Any) -> None:
+def inflate_point(student: Student) -> None:
     occupancy = np.zeros((15, 17), dtype=np.int8)
-    occupancy[7, 8] = 100
-    tools.compare_inflation(student.inflate, occupancy, 0.1, radius=0.25, decay=0.2, weight=8.0)
+    occupancy[tuple(student.rng("obstacle").integers(5, 10, 2))] = 100
+    plans.compare_inflation(student, occupancy, 0.1, radius=0.25, decay=0.2, weight=8.0)
 
 
 @suite.test("inflate", points=1, name="a map without obstacles", hint="empty-map", reread="Exercise 2.1")
-def inflate_empty(student: Any) -> None:
-    occupancy = np.zeros((3, 4), dtype=np.int8)
-    expect_close(student.inflate(occupancy, 0.05), np.ones((3, 4)), given="3 x 4 free cells, int8, no obstacle")
+def inflate_empty(student: Student) -> None:
+    occupancy = np.where(student.rng("empty").random((3, 4)) < 0.3, -1, 0).astype(np.int8)
+    expected = np.where(occupancy == -1, 3.0, 1.0)
+    given = f"3 x 4 cells, int8, no obstacle, {int((occupancy == -1).sum())} of them unknown"
+    judging.compare(student.inflate(occupancy, 0.05), expected, given=given)
 
 
 @suite.test("inflate", points=1, name="unknown cells cost 2 more", reread="Exercise 2.1")
-def inflate_unknown(student: Any) -> None:
+def inflate_unknown(student: Student) -> None:
     occupancy = np.zeros((9, 9), dtype=np.int8)
-    occupancy[0, 0] = 100
+    occupancy[0, int(student.rng("unknown").integers(4))] = 100
     occupancy[4:, 4:] = -1
-    tools.compare_inflation(student.inflate, occupancy, 0.1, radius=0.15, decay=0.1, weight=5.0)
+    plans.compare_inflation(student, occupancy, 0.1, radius=0.15, decay=0.1, weight=5.0)
 
 
 @suite.test("astar", points=2, name="straight across an empty field", reread="Exercise 2.2")
-def astar_straight(student: Any) -> None:
-    tools.compare_astar(student.astar, np.ones((5, 9)), (2, 0), (2, 8))
+def astar_straight(student: Student) -> None:
+    rng = student.rng("straight")
+    row, columns = int(rng.integers(5)), int(rng.integers(7, 16))
+    plans.compare_astar(student, plans.Maze(np.ones((5, columns)), (row, 0), (row, columns - 1)).turned(rng))
 
 
 @suite.test("astar", points=2, name="diagonal steps are longer", hint="diagonal-cost", reread="Exercise 2.2")
-def astar_diagonal(student: Any) -> None:
-    cost = np.ones((7, 12))
-    path = tools.compare_astar(student.astar, cost, (1, 0), (3, 11))
+def astar_diagonal(student: Student) -> None:
+    rng = student.rng("diagonal")
+    row, columns = int(rng.integers(5)), int(rng.integers(10, 16))
+    maze = plans.Maze(np.ones((7, columns)), (row, 0), (row + 2, columns - 1)).turned(rng)
+    path = plans.compare_astar(student, maze)
     # Any optimal path has exactly two diagonal steps; a zigzag that is as long in steps has more.
     diagonals = int((np.abs(np.diff(path, axis=0)).sum(axis=1) == 2).sum())
     expect(diagonals == 2, "the path zigzags", got=f"{diagonals} diagonal steps", expected="2 diagonal steps")
 
 
 @suite.test("astar", points=2, name="around a dear patch", hint="use-the-costs", reread="Exercise 2.2")
-def astar_weights(student: Any) -> None:
+def astar_weights(student: Student) -> None:
+    rng = student.rng("patch")
     cost = np.ones((9, 11))
     cost[2:7, 4:7] = 9.0
-    tools.compare_astar(student.astar, cost, (4, 0), (4, 10))
+    start, goal = (int(row) for row in rng.integers(3, 6, 2))
+    plans.compare_astar(student, plans.Maze(cost, (start, int(rng.integers(3))), (goal, 10)).turned(rng))
 
 
 @suite.test("astar", points=1, name="no route is None", hint="no-route", reread="Exercise 2.2, last paragraph")
-def astar_no_route(student: Any) -> None:
+def astar_no_route(student: Student) -> None:
+    rng = student.rng("no route")
+    # An answer that is None for every map has not understood the question.
+    ends = [(int(row), column) for row, column in zip(rng.integers(9, size=2), (0, 2), strict=True)]
+    plans.compare_astar(student, plans.Maze(np.ones((9, 3)), ends[0], ends[1]).turned(rng))
     cost = np.ones((5, 5))
     cost[:, 2] = np.inf
-    # An answer that is None for every map has not understood the question.
-    tools.compare_astar(student.astar, np.ones((3, 3)), (0, 0), (2, 2))
-    answer = student.astar(cost, (2, 0), (2, 4))
-    expect(answer is None, "there is no route through a closed wall", got=answer, expected="None")
+    plans.compare_astar(student, plans.Maze(cost, (2, 0), (2, 4)).turned(rng))
 
 
 @suite.test("smooth", points=2, name="a staircase in the open becomes one segment", hint="farthest-first")
-def smooth_open(student: Any) -> None:
-    path = [(0, 0), (1, 1), (1, 2), (2, 3), (2, 4), (3, 5), (3, 6), (4, 7)]
-    kept = tools.smoothed(student.smooth, path, np.ones((6, 9)))
-    expect(kept == [(0, 0), (4, 7)], got=kept, expected=[(0, 0), (4, 7)], given=path)
+def smooth_open(student: Student) -> None:
+    rng = student.rng("staircase")
+    turn, columns = plans.Turn.random(rng), int(rng.integers(6, 14))
+    path = [turn.cell(((column + 1) // 2, column), (8, 16)) for column in range(columns)]
+    kept = plans.smoothed(student, path, turn.grid(np.ones((8, 16))))
+    ends = [path[0], path[-1]]
+    expect(kept == ends, got=kept, expected=ends, given=path)
 
 
 @suite.test("smooth", points=1, name="the next cell is always allowed", hint="next-cell-always", time_limit_s=2.0)
-def smooth_next(student: Any) -> None:
-    cost = np.ones((3, 3))
-    cost[0, 1] = cost[1, 0] = cost[1, 2] = cost[2, 1] = 40.0
-    path = [(0, 0), (1, 1), (2, 2)]
-    kept = tools.smoothed(student.smooth, path, cost)
+def smooth_next(student: Student) -> None:
+    rng = student.rng("next")
+    size = int(rng.integers(3, 9))
+    cost = np.full((size, size), 40.0)
+    np.fill_diagonal(cost, 1.0)
+    turn = plans.Turn.random(rng)
+    path = [turn.cell((k, k), cost.shape) for k in range(size)]
+    kept = plans.smoothed(student, path, turn.grid(cost))
     expect(kept == path, got=kept, expected=path, given="dear cells on both sides of a diagonal path")
 
 
 @suite.test("smooth", points=1, name="never through a wall", hint="lethal-shortcut", reread="Exercise 2.3")
-def smooth_wall(student: Any) -> None:
+def smooth_wall(student: Student) -> None:
     cost = np.ones((8, 9))
     cost[0:6, 4] = np.inf
     path = [(1, 1), (2, 2), (3, 3), (4, 3), (5, 3), (6, 3), (6, 4), (6, 5), (5, 5), (4, 5), (3, 5), (2, 6), (1, 7)]
-    tools.check_smoothed(student.smooth, path, cost)
+    plans.check_smoothed(student, plans.Detour(cost, path), turn=plans.Turn.random(student.rng("wall")))
 
 
 # ---------------------------------------------------------------- Part 3
 
 
 @suite.test("goal_tracker", points=2, name="three sightings from one place", reread="Exercise 3.1")
-def tracker_still(student: Any) -> None:
-    tools.compare_tracker(student.GoalTracker, poses=[(0, (1.0, 2.0, np.pi / 2)), (10**9, (1.0, 2.0, np.pi / 2))])
+def tracker_still(student: Student) -> None:
+    tools.compare_tracker(student, tools.steady_poses((1.0, 2.0, np.pi / 2)), student.rng("still"))
 
 
 @suite.test("goal_tracker", points=2, name="a robot that turns while the network thinks", reread="Exercise 3.1")
-def tracker_turning(student: Any) -> None:
+def tracker_turning(student: Student) -> None:
     poses = [(k * 10**8, (0.0, 0.0, 0.1 * k)) for k in range(11)]
-    tools.compare_tracker(student.GoalTracker, poses=poses)
+    tools.compare_tracker(student, poses, student.rng("turning"))
 
 
 @suite.test("goal_tracker", points=1, name="two sightings are no goal", hint="three-sightings", reread="Exercise 3.1")
-def tracker_patience(student: Any) -> None:
+def tracker_patience(student: Student) -> None:
     tracker = student.GoalTracker()
     tracker.add_pose(0, (0.0, 0.0, 0.0))
-    expect(tracker.goal() is None, "a goal without any sighting", got=tracker.goal(), expected="None")
-    for _ in range(2):
+    for count in ("without any sighting", "after one sighting", "after two sightings"):
+        goal = tracker.goal()
+        expect(goal is None, f"a goal {count}", got=goal, expected="None")
         tracker.add_sighting(0, (1.0, 0.0))
-    expect(tracker.goal() is None, "a goal after two sightings", got=tracker.goal(), expected="None")
+    expect(tracker.goal() is not None, "no goal after three sightings", got="None")
 
 
 @suite.test("planner_node", points=3, name="answers with a path around a wall", reread="Exercise 3.2", time_limit_s=20)
-def planner_answers(student: Any) -> None:
-    tools.compare_plan(student.MyPlanner, tools.walled_map(), (-1.5, 0.4), (1.5, 0.4))
+def planner_answers(student: Student) -> None:
+    gap, *ys = (float(v) for v in student.rng("wall").uniform((-0.6, 0.2, 0.2), (-0.4, 0.6, 0.6)))
+    room = walled_room(gap=gap)
+    bench = PlannerBench.of(student, "MyPlanner")
+    bench.show(room)
+    plans.compare_plan(bench, room, (-1.5, ys[0]), (1.5, ys[1]))
 
 
 @suite.test(
@@ -289,41 +322,52 @@ def planner_answers(student: Any) -> None:
     reread="Exercise 3.2",
     time_limit_s=20,
 )
-def planner_without_map(student: Any) -> None:
-    points = tools.ask_for_plan(student.MyPlanner, None, (0.0, 0.0), (1.0, 0.0))
+def planner_without_map(student: Student) -> None:
+    bench = PlannerBench.of(student, "MyPlanner")
+    points = bench.ask((0.0, 0.0), (1.0, 0.0))
     expect(len(points) == 0, "a path without a map", got=points, expected="an empty path")
+    # A node that never answers with a path has not understood the question.
+    bench.show(open_room())
+    expect(len(bench.ask((0.0, 0.0), (1.0, 0.0))) > 0, "no path with a map either", got="an empty path")
 
 
 # ---------------------------------------------------------------- Parts 4 and 5
 
 
 @suite.test("evaluate", points=1, name="the rate of made-up runs", reread="Exercise 4")
-def evaluate_rate(student: Any) -> None:
-    tools.compare_evaluation(student.evaluate, [True] * 7 + [False] * 3, ("success_rate",))
+def evaluate_rate(student: Student) -> None:
+    rng = student.rng("rate")
+    tools.compare_evaluation(student, tools.some_wins(rng), rng, ("success_rate",))
 
 
 @suite.test("evaluate", points=1, name="Wilson's interval of made-up runs", reread="Exercise 4")
-def evaluate_interval(student: Any) -> None:
-    tools.compare_evaluation(student.evaluate, [True] * 7 + [False] * 3, ("interval",))
+def evaluate_interval(student: Student) -> None:
+    rng = student.rng("interval")
+    tools.compare_evaluation(student, tools.some_wins(rng), rng, ("interval",))
 
 
 @suite.test("evaluate", points=1, name="the 95th percentile of made-up runs", reread="Exercise 4")
-def evaluate_percentile(student: Any) -> None:
-    tools.compare_evaluation(student.evaluate, [True] * 7 + [False] * 3, ("p95_ms",))
+def evaluate_percentile(student: Student) -> None:
+    rng = student.rng("percentile")
+    tools.compare_evaluation(student, tools.some_wins(rng), rng, ("p95_ms",))
 
 
 @suite.test("evaluate", points=2, name="one drive per seed", hint="once-per-seed", reread="Exercise 4")
-def evaluate_calls(student: Any) -> None:
+def evaluate_calls(student: Student) -> None:
     calls: list[int] = []
 
     def drive(seed: int) -> Any:
         calls.append(seed)
         return tools.made_up_run(True, np.array([5.0]))
 
-    student.evaluate(drive, range(3, 9))
-    expect(sorted(calls) == list(range(3, 9)), got=calls, expected=list(range(3, 9)), given="seeds 3 to 8")
+    seeds = [int(seed) for seed in student.rng("seeds").choice(50, 6, replace=False)]
+    student.evaluate(drive, seeds)
+    expect(sorted(calls) == sorted(seeds), got=calls, expected=seeds, given=f"seeds {seeds}")
 
 
 @suite.test("gap", points=4, name="five pairs worked out by hand", reread="Exercise 5.1")
-def gap_by_hand(student: Any) -> None:
-    tools.compare_gap(student.paired_gap, [20.0, 31.0, 44.0, 25.0, 38.0], [21.5, 33.0, 44.5, 27.5, 41.0])
+def gap_by_hand(student: Student) -> None:
+    shift = round(float(student.rng("pairs").uniform(0, 5)), 1)
+    tools.compare_gap(
+        student, [20.0, 31.0, 44.0, 25.0, 38.0], [21.5 + shift, 33.0 + shift, 44.5 + shift, 27.5 + shift, 41.0 + shift]
+    )

@@ -1,0 +1,46 @@
+"""Runs many tasks side by side and hands each result, as it comes, to one consumer."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from typing import TypeVar
+
+_Task = TypeVar("_Task")
+_Result = TypeVar("_Result")
+_AHEAD = 2  # tasks handed out per worker, so that none waits for the consumer
+_POLL_S = 0.5  # Windows does not interrupt a wait without an end
+
+
+def run(
+    tasks: Iterable[_Task],
+    work: Callable[[_Task], _Result],
+    consume: Callable[[_Result], None],
+    *,
+    workers: int = 1,
+    stop: Callable[[], None] | None = None,
+) -> None:
+    """Call ``work`` on each task in threads, and ``consume`` on each result in this one, in the order they end.
+
+    Tasks are taken as workers become free, so that neither tasks nor results pile up. An exception in ``work`` or
+    ``consume``, and Ctrl-C, end it: no further task begins, ``stop`` is called to cut short those that run, and the
+    exception goes on to the caller once they have ended.
+    """
+    feed = iter(tasks)
+    with ThreadPoolExecutor(max_workers=max(1, workers), thread_name_prefix="grade") as pool:
+        running: set[Future[_Result]] = set()
+        try:
+            while True:
+                for task in itertools.islice(feed, _AHEAD * max(1, workers) - len(running)):
+                    running.add(pool.submit(work, task))
+                if not running:
+                    return
+                ended, running = wait(running, timeout=_POLL_S, return_when=FIRST_COMPLETED)
+                for future in ended:
+                    consume(future.result())
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            if stop is not None:
+                stop()
+            raise

@@ -1,0 +1,1 @@
+"""The trusted process that tests one submission, whose code runs in another process."""
