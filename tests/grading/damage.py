@@ -680,7 +680,9 @@ def the_file_is_gzip(data: bytes, rng: random.Random, lab: Lab) -> tuple[bytes]:
 
 @damage("packed", FILE, "ZIP")
 def the_file_is_a_zip_archive(data: bytes, rng: random.Random, lab: Lab) -> tuple[bytes]:
-    return (zipped({"work/lab.ipynb": data, "__MACOSX/work/._lab.ipynb": b"\0\5\x16\7", "notes.txt": b"hello"}),)
+    return (
+        zipped({"handed_in/lab.ipynb": data, "__MACOSX/handed_in/._lab.ipynb": b"\0\5\x16\7", "notes.txt": b"hello"}),
+    )
 
 
 def zipped(files: dict[str, bytes]) -> bytes:

@@ -81,9 +81,9 @@ def highlighted(source: str) -> Markup:
     """Python as coloured, escaped text; very long code without colours, and cut."""
     if len(source) > _COLOURED:
         return Markup.escape(clean(source, LONGEST_SOURCE))
-    from pygments import highlight  # type: ignore[import-untyped]
-    from pygments.formatters.html import HtmlFormatter  # type: ignore[import-untyped]
-    from pygments.lexers.python import PythonLexer  # type: ignore[import-untyped]
+    from pygments import highlight
+    from pygments.formatters.html import HtmlFormatter
+    from pygments.lexers.python import PythonLexer
 
     formatter = HtmlFormatter(nowrap=True)
     return Markup(highlight(clean(source, LONGEST_SOURCE), PythonLexer(stripnl=False), formatter).rstrip("\n"))

@@ -124,7 +124,7 @@ def _seccomp() -> bytes | None:
 
 
 def imports_of(autograder: Path, labs: Iterable[str]) -> list[str]:
-    """What the labs' notebooks import, as ``names.import_all`` reads it, and their visible tests: each copy needs both."""
+    """What the labs' notebooks import, for ``names.import_all``, and their visible tests, which every copy needs."""
     modules: list[str] = []
     for lab in labs:
         for path in (autograder.parent / "solutions" / lab).glob("*.ipynb"):

@@ -317,9 +317,13 @@ def stages_of_repair() -> Mapping[str, BrainSetup]:
     }
 
 
-@functools.cache
 def brain_run(stage: str, module: str = "orin-nano-8gb:15W", seconds: float = 2.5, world: int = 12) -> RunResult:
     """Return a short traced run of a stage of repair; runs are deterministic, so each is made once."""
+    return _brain_run(stage, module, seconds, world)  # a cache tells apart what is left out and what is spelled out
+
+
+@functools.cache
+def _brain_run(stage: str, module: str, seconds: float, world: int) -> RunResult:
     return replace(stages_of_repair()[stage], module=module).drive(world, time_limit=seconds, trace=True)
 
 
