@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint format lab labs book train bench profiles proof-drive proof-devices proof-bottlenecks proof-reach proof-velocity proof-gap conformance-ros conformance-isaaclab conformance-tensorrt proof-optimisation mutation-test clean
+.PHONY: help install demo test lint format lab labs book train bench profiles proof-drive proof-devices proof-bottlenecks proof-reach proof-velocity proof-gap conformance-ros conformance-isaaclab conformance-tensorrt proof-optimisation mutation-test attacks proof-grading clean
 
 help:  ## Show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-15s %s\n", $$1, $$2}'
@@ -94,6 +94,13 @@ profiles: $(STAMP)  ## Calibrate the Jetson twin and write the reference profile
 
 mutation-test: $(STAMP)  ## Test the tests of the labs with named wrong solutions
 	$(BIN)/robotbrain mutation-test --all --jobs 2
+
+attacks: $(STAMP)  ## Try every attack on the grader, in all its variants (ten minutes)
+	ROBOTBRAIN_ATTACKS=all $(BIN)/python -m pytest tests/grading/attacks
+
+proof-grading: $(STAMP)  ## The grader against stock nbgrader, and a thousand submissions with kills (an hour)
+	$(BIN)/python benchmarks/grading_stock.py
+	$(BIN)/python benchmarks/grading_thousand.py
 
 bench: $(STAMP)  ## Run the benchmarks; each prints one table
 	$(BIN)/python benchmarks/ros_rate.py

@@ -43,6 +43,7 @@ COMMANDS: dict[str, Command] = {
     "generate": Command("robotbrain.grading.commands:generate", "make the students' version of a lab"),
     "sample-class": Command("robotbrain.grading.commands:sample_class", "make submissions to try grading on"),
     "mutation-test": Command("robotbrain.grading.commands:mutation_test", "test the tests of a lab"),
+    "assessment": Command("robotbrain.assessment.commands:assessment", "draw papers for a class, check the bank"),
     "notebooks": Command("robotbrain.notebooks", "check or fix the stored form of notebooks"),
     "doctor": Command("robotbrain.grading.doctor", "say what is installed and what is missing"),
 }
