@@ -155,7 +155,8 @@ class _Run:
 
     def _journal(self, bench: jobs.Bench) -> jobs.Journal:
         autograder = self.course.autograder
-        tests = [autograder / "hidden", autograder / "profiles", autograder / CONFIG_NAME, self.sources[0].parent]
+        names = ("hidden", "reference", "profiles", CONFIG_NAME)
+        tests = [*(autograder / name for name in names), self.sources[0].parent]
         layers = [layer.name for layer in bench.layers if layer.active]
         return jobs.Journal(self.kept / "cache", jobs.environment_digest(tests, self.options.limits, layers))
 

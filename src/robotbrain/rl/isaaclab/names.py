@@ -225,7 +225,8 @@ ROUTES = (
         "source",
         ("git clone https://github.com/isaac-sim/IsaacLab.git && cd IsaacLab", "./isaaclab.sh -i"),
         "For changing Isaac Lab itself. `./isaaclab.sh -i` installs the repository's packages into the active "
-        "environment; `./isaaclab.sh -i core` takes fewer of them.",
+        "environment; `./isaaclab.sh -i core` takes fewer of them. Release 3.0 calls the script legacy and recommends "
+        "uv, and the main branch no longer has it: check out a release's tag first.",
     ),
     Route(
         "container",
