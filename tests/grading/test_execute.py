@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import subprocess
+import sys
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -289,3 +293,23 @@ def test_graded_cells_without_a_sane_score_give_nothing(source: str, outputs: li
     cell = _graded_cell(source, *map(_result, outputs))
     make_gradable(cell)
     assert marks_of(new_notebook(cells=[cell]))[0].earned == earned
+
+
+def test_folders_of_a_grader_that_was_killed_are_removed_by_the_next_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    abandoned = tmp_path / f"robotbrain-{ended.pid}-x"
+    young, ours = tmp_path / f"robotbrain-{ended.pid}-y", tmp_path / f"robotbrain-{os.getpid()}-x"
+    for folder in (abandoned, young, ours):
+        folder.mkdir()
+        (folder / "answer.txt").write_text("1")
+    for folder in (abandoned, ours):
+        os.utime(folder, (0, 0))
+    with Bench(tmp_path, preload=()):
+        pass
+    assert not abandoned.exists()
+    assert young.exists()
+    assert ours.exists()

@@ -5,13 +5,16 @@ from __future__ import annotations
 import atexit
 import contextlib
 import copy
+import os
 import shutil
 import tempfile
 import threading
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import psutil
 from nbformat.notebooknode import NotebookNode
 
 from robotbrain.errors import InputError
@@ -26,6 +29,7 @@ from robotbrain.grading.tester_link import TesterProcess
 
 _TRIES = 3
 _CPU_SLACK_S = 30.0
+_ABANDONED_S = 3600.0  # a folder of a grader that is gone is removed after this time, when the next one starts
 
 
 class Bench:
@@ -58,6 +62,7 @@ class Bench:
         self._testers = ForkServer(recipes.tester(self._autograder, preload_labs))
         self._layers: list[Layer] | None = None
         self._lock = threading.Lock()
+        _remove_abandoned()
         if require_sandbox:
             missing = required_missing(self.layers)
             if missing:
@@ -120,7 +125,7 @@ class Bench:
     def start_student(self, limits: Limits, student: str, files: Mapping[str, bytes]) -> StudentProcess:
         """A fresh student's process with the submission's files."""
         private = recipes.wrapped(self._students.recipe)  # then it gets a working directory of its own making
-        folder = "" if private else tempfile.mkdtemp(prefix="robotbrain-")
+        folder = "" if private else _new_folder()
         process = StudentProcess(
             self._students,
             environment=recipes.student_environment(student, self._students.recipe),
@@ -140,7 +145,7 @@ class Bench:
         self, lab: str, student: str, files: Mapping[str, bytes], sources: Sequence[Mapping[str, Any]]
     ) -> TesterProcess:
         """A fresh tester, with the submission's files in a folder of its own."""
-        folder = tempfile.mkdtemp(prefix="robotbrain-tester-") if files else ""
+        folder = _new_folder() if files else ""
         for name, data in files.items():
             path = Path(folder, name)
             if path.is_relative_to(folder) and ".." not in Path(name).parts:
@@ -170,6 +175,21 @@ class Bench:
             except (ServerDied, StartError) as error:
                 why = str(error)
         return layers_of(held, wrapped=recipes.wrapped(self._students.recipe), cgroups=self._cgroups, failure=why)
+
+
+def _new_folder() -> str:
+    """A folder for the files of a submission, named after this process."""
+    return tempfile.mkdtemp(prefix=f"robotbrain-{os.getpid()}-")
+
+
+def _remove_abandoned() -> None:
+    """Remove the folders of graders that were killed before they could."""
+    for path in Path(tempfile.gettempdir()).glob("robotbrain-*-*"):
+        with contextlib.suppress(OSError):
+            number = path.name.split("-")[1]
+            old = time.time() - path.lstat().st_mtime > _ABANDONED_S
+            if old and number.isdigit() and not psutil.pid_exists(int(number)):
+                shutil.rmtree(path, ignore_errors=True)
 
 
 def host_layers() -> list[Layer]:
