@@ -17,6 +17,7 @@ from robotbrain.errors import InputError, RobotBrainError
 from robotbrain.grading import backups, classroom
 from robotbrain.grading.cluster import ClusterBench
 from robotbrain.grading.course import Course, find_course
+from robotbrain.grading.execute import Limits
 from tests.conftest import need
 from tests.grading import toylab
 from tests.grading.fakebench import FakeBench, answers
@@ -126,8 +127,9 @@ def test_real_benches_on_two_workers_give_the_same_gradebook(home: Course, tmp_p
     ):
         toylab.submit(tmp_path / "in", f"s{number}", toylab.solved(scale=answer))
     with _scheduler(tmp_path) as (address, _), _workers(address, tmp_path, 2):
-        options = classroom.Options(cluster=address)
+        options = classroom.Options(cluster=address, limits=Limits(cell_s=2.0))
         classroom.grade_class(home, toylab.LAB, submitted=tmp_path / "in", out=tmp_path / "cluster", options=options)
-    classroom.grade_class(home, toylab.LAB, submitted=tmp_path / "in", out=tmp_path / "here")
+    options = classroom.Options(limits=options.limits)
+    classroom.grade_class(home, toylab.LAB, submitted=tmp_path / "in", out=tmp_path / "here", options=options)
     there, here = (backups.contents(f"sqlite:///{tmp_path / name / 'gradebook.db'}") for name in ("cluster", "here"))
     assert there == here

@@ -456,7 +456,7 @@ def test_no_object_can_pass_for_a_value(student: RemoteStudent) -> None:
         assert type(thing) is Proxy and type(student.thing("namespace").x) is Proxy
         for other in (1, 1.0, True, "a", None, [1], np.ones(3), Pose2D(1.0, 2.0, 3.0)):
             assert (thing == other) is (other == thing) is False
-        for judge in (bool, float, int, complex, np.asarray, np.mean, range):
+        for judge in (bool, float, int, complex, np.asarray, np.isfinite, range):
             with pytest.raises(TypeError):
                 judge(thing)
         with pytest.raises(TypeError):

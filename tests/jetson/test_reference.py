@@ -120,7 +120,9 @@ def _earned(repo: Path, exercise: str, test: str, **answers: object) -> bool:
     """Return whether one hidden test of the lab is passed by these answers."""
     from robotbrain.grading.expect import CheckFailure
     from robotbrain.grading.student import Student
+    from robotbrain.grading.suites import lab_integration_tools as tools
 
+    tools.reference_profile.cache_clear()  # a grader starts anew where the profiles change
     suite = load_hidden_suite("lab_integration", repo / "autograder")
     chosen = next(t for t in suite.tests if (t.exercise, t.name) == (exercise, test))
     try:
@@ -128,19 +130,6 @@ def _earned(repo: Path, exercise: str, test: str, **answers: object) -> bool:
     except CheckFailure:
         return False
     return True
-
-
-def test_changing_a_profile_changes_the_grade_of_a_driving_brain(repo: Path, copy: Path) -> None:
-    from robotbrain.pipeline.nodes.planner import PlannerNode
-
-    test = ("planner_node", "drives a robot to the marker")
-    assert _earned(repo, *test, MyPlanner=PlannerNode)
-    _slower_cpu(copy, "orin-nano-8gb", 15.0)
-    path = copy / "modules" / "orin-nano-8gb.toml"
-    text, count = re.subn(r"^cpu_mhz = .*$", "cpu_mhz = 300", path.read_text(encoding="utf-8"), flags=re.MULTILINE)
-    assert count == 2
-    path.write_text(text, encoding="utf-8")
-    assert not _earned(repo, *test, MyPlanner=PlannerNode)
 
 
 def test_changing_a_reference_changes_what_counts_as_right(repo: Path, copy: Path) -> None:

@@ -300,7 +300,7 @@ def _add_accidents(reference: Reference, add: Callable[..., None]) -> None:
 
 
 def _insert(source: str, statement: str) -> str:
-    """Put ``statement`` first into every function of ``source``, or at its end where there is none."""
+    """Put ``statement`` first into every function of ``source``, or at its beginning where there is none."""
     lines = source.splitlines()
     functions = [n for n in ast.walk(ast.parse(source)) if isinstance(n, (ast.FunctionDef, ast.AsyncFunctionDef))]
     starts = {}
@@ -310,7 +310,7 @@ def _insert(source: str, statement: str) -> str:
         starts[body[1 if documented else 0].lineno] = body[1 if documented else 0].col_offset
     for line in sorted(starts, reverse=True):
         lines.insert(line - 1, " " * starts[line] + statement)
-    return "\n".join(lines if starts else [*lines, statement])
+    return "\n".join(lines if starts else [statement, *lines])
 
 
 def _without_last_test(notebooks: dict[str, NotebookNode]) -> dict[str, NotebookNode]:
