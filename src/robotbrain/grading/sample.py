@@ -265,7 +265,10 @@ def make_class(
 def _add_accidents(reference: Reference, add: Callable[..., None]) -> None:
     """Submissions every class has: unfinished, broken, damaged."""
     answers = reference.answers()
-    first, last = answers[0], answers[-1]
+    sources = {intake.grade_id(c): c.source for nb in reference.notebooks.values() for c in nb.cells}
+    first = answers[0]
+    # A loop in a function is met by its tests; one in a cell of settings might come after all that counts.
+    last = next((a for a in reversed(answers) if "def " in sources[a]), answers[-1])
     add("stub", "empty", "zero", reference.stubs)
     half = {name: copy.deepcopy(nb) for name, nb in reference.stubs.items()}
     solved = set(answers[: (len(answers) + 1) // 2])
@@ -286,12 +289,11 @@ def _add_accidents(reference: Reference, add: Callable[..., None]) -> None:
         ("infinite-loop", "while True: pass", last),
         ("kernel-death", "import os; os._exit(1)", first),
     ):
-        source = next(c.source for nb in reference.notebooks.values() for c in nb.cells if intake.grade_id(c) == cell)
         add(
             "accident",
             name,
             "exercise",
-            reference.edit({cell: _insert(source, statement)}, name),
+            reference.edit({cell: _insert(sources[cell], statement)}, name),
             exercise=reference.exercise_after(cell),
         )
     add("accident", "deleted-test-cell", "full", _without_last_test(reference.copy()))
