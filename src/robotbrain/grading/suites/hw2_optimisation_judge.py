@@ -115,7 +115,8 @@ def compare_iou(student: Any, rng: np.random.Generator, training: bool = False, 
     given = f"a small network, {len(test)} images of 8x8 pixels in the test split"
     hint = tools.first_match(answer, lambda: _iou_mistakes(splits, answers, logits, counts), expected)
     tools.expect_untouched(before, found["state"], "the network", "evaluate-in-eval")
-    expect_close(answer, expected, rtol=1e-5, given=given, hint=hint or ("absent-classes" if absent else ""),
+    # Two classes may tie in a pixel, and another batch size rounds another way: a few pixels of 40 960 decide nothing.
+    expect_close(answer, expected, atol=5e-5, rtol=1e-5, given=given, hint=hint or ("absent-classes" if absent else ""),
                  what="the mean IoU")  # fmt: skip
     tools.expect_mode(found["training"], network, training, given, "leave-the-mode")
 
