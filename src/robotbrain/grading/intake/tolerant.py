@@ -126,15 +126,7 @@ class _Reader:
 
     def _object(self, depth: int) -> dict[str, Any]:
         pairs: list[tuple[str, Any]] = []
-        while self.left > 0:
-            self._blank()
-            if self.pos >= len(self.text):
-                self.cut = True
-                break
-            char = self.text[self.pos]
-            if char in "}]":
-                self.pos += char == "}"
-                break
+        while self.left > 0 and not self._ended("}"):
             key = self._value(depth + 1)
             match = _COLON.match(self.text, self.pos)
             self.pos = match.end() if match else self.pos
@@ -152,20 +144,22 @@ class _Reader:
 
     def _list(self, depth: int) -> list[Any]:
         found = []
-        while self.left > 0:
-            self._blank()
-            if self.pos >= len(self.text):
-                self.cut = True
-                break
-            char = self.text[self.pos]
-            if char in "]}":
-                self.pos += char == "]"
-                break
-            if char == ":":
+        while self.left > 0 and not self._ended("]"):
+            if self.text[self.pos] == ":":
                 self.pos += 1
                 continue
             found.append(self._value(depth + 1))
         return found
+
+    def _ended(self, closing: str) -> bool:
+        """Whether nothing more belongs to what ``closing`` closes: a bracket of the other kind is its parent's."""
+        self._blank()
+        if self.pos >= len(self.text):
+            self.cut = True
+            return True
+        char = self.text[self.pos]
+        self.pos += char == closing
+        return char in "}]"
 
     def _blank(self) -> None:
         match = _BLANK.match(self.text, self.pos)

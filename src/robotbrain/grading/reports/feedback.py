@@ -20,9 +20,9 @@ from robotbrain.grading.marks import Mark, Marks, marks_of
 from robotbrain.grading.report import SCORE_MIME
 from robotbrain.grading.reports import cells
 from robotbrain.grading.reports.grades import GradedNotebook, graded_notebook, open_gradebook
-from robotbrain.grading.reports.model import TestOutcome, outcomes_of, unprotected
+from robotbrain.grading.reports.model import outcomes_of, unprotected
 from robotbrain.grading.reports.page import render
-from robotbrain.grading.results import Verdict
+from robotbrain.grading.results import TestResult, Verdict
 
 STEPS = 3
 _EMPTY_COMMENT = "No response."  # nbgrader's own, on answers nobody wrote
@@ -52,7 +52,7 @@ class ExerciseView:
     extra: float
     error: str
     substituted: Sequence[str]
-    tests: Sequence[TestOutcome]
+    tests: Sequence[TestResult]
     comments: Sequence[str]
 
     @property

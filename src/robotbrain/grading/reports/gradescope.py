@@ -18,8 +18,9 @@ from robotbrain.errors import InputError
 from robotbrain.files import atomic_path, write_text
 from robotbrain.grading.course import Course, find_course
 from robotbrain.grading.marks import Mark, Marks
-from robotbrain.grading.reports.model import TestOutcome, outcomes_of, unprotected
+from robotbrain.grading.reports.model import outcomes_of, unprotected
 from robotbrain.grading.reports.page import clean
+from robotbrain.grading.results import TestResult
 
 VISIBILITIES = ("visible", "after_due_date", "after_published", "hidden")
 _COURSE_PARTS = ("autograder/nbgrader_config.py", "autograder/profiles")
@@ -113,7 +114,7 @@ def _entry(
     }
 
 
-def _output(outcome: TestOutcome) -> str:
+def _output(outcome: TestResult) -> str:
     parts = [
         ("", outcome.verdict.label),
         ("", outcome.message),

@@ -11,8 +11,8 @@ import numpy as np
 
 from robotbrain.grading.marks import Mark, Marks
 from robotbrain.grading.reports import statistics
-from robotbrain.grading.reports.model import TestOutcome, outcomes_of, ran
-from robotbrain.grading.results import Verdict
+from robotbrain.grading.reports.model import outcomes_of, ran
+from robotbrain.grading.results import TestResult, Verdict
 
 SMALL_CLASS = 30
 """Below this many submissions the report says that its numbers mean little."""
@@ -107,7 +107,7 @@ class _Answer:
 
     points: float
     earned: float
-    outcomes: list[TestOutcome]
+    outcomes: list[TestResult]
 
 
 def _tests_of(mark: Mark) -> dict[Key, _Answer]:
@@ -152,14 +152,14 @@ def _items(
     return items, scores
 
 
-def _verdicts(met: Sequence[Sequence[TestOutcome]], students: int) -> dict[str, int]:
+def _verdicts(met: Sequence[Sequence[TestResult]], students: int) -> dict[str, int]:
     counted = Counter(o.verdict.label for outcomes in met for o in outcomes)
     if students > len(met):
         counted["did not run"] = students - len(met)
     return dict(counted.most_common())
 
 
-def _mistakes(met: Sequence[Sequence[TestOutcome]]) -> tuple[Mistake, ...]:
+def _mistakes(met: Sequence[Sequence[TestResult]]) -> tuple[Mistake, ...]:
     """What was told to how many; a student who was told the same twice counts once."""
     counted: Counter[str] = Counter()
     for outcomes in met:

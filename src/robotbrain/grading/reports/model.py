@@ -11,7 +11,7 @@ from typing import Any
 
 from robotbrain.errors import InputError
 from robotbrain.grading.marks import Mark, Marks
-from robotbrain.grading.results import Verdict
+from robotbrain.grading.results import TestResult, Verdict
 from robotbrain.grading.sandbox.layers import warning_of
 
 _LONGEST = 4000  # characters of one field of a test
@@ -25,40 +25,15 @@ class GradedClass:
     rows: tuple[Marks, ...]
 
 
-@dataclass(frozen=True)
-class TestOutcome:
-    """One test of one student, fit to be shown: a hidden test has no more than name, verdict, points and hint."""
+def outcomes_of(mark: Mark) -> list[TestResult]:
+    """The tests of ``mark``, fit to be shown: a hidden one has no more than name, verdict, points and hint.
 
-    __test__ = False
-
-    exercise: str
-    name: str
-    verdict: Verdict
-    points: float
-    earned: float
-    message: str = ""
-    given: str = ""
-    expected: str = ""
-    got: str = ""
-    misconception: str = ""
-    hint_key: str = ""
-    hint: str = ""
-    reread: str = ""
-    printed: str = ""
-    hidden: bool = False
-
-    @property
-    def passed(self) -> bool:
-        """Whether it gave all its points."""
-        return self.verdict is Verdict.PASSED
-
-
-def outcomes_of(mark: Mark) -> list[TestOutcome]:
-    """The tests of ``mark``; entries that are none (a forged report may hold anything) are left out."""
+    Entries that are none (a forged report may hold anything) are left out.
+    """
     return [_outcome(test) for test in mark.tests if isinstance(test, Mapping)]
 
 
-def _outcome(test: Mapping[str, Any]) -> TestOutcome:
+def _outcome(test: Mapping[str, Any]) -> TestResult:
     hidden = test.get("hidden") is not False  # only what says that it may be shown is shown
     shown = ["hint_key", "hint", "reread"]
     if not hidden:
@@ -67,14 +42,15 @@ def _outcome(test: Mapping[str, Any]) -> TestOutcome:
         verdict = Verdict(str(test.get("verdict")))
     except ValueError:
         verdict = Verdict.ERROR
-    return TestOutcome(
+    words: dict[str, Any] = {key: _text(test.get(key)) for key in shown}
+    return TestResult(
         exercise=_text(test.get("exercise")),
         name=_text(test.get("name"))[:200],
         verdict=verdict,
         points=_number(test.get("points")) or 0.0,
         earned=_number(test.get("earned")) or 0.0,
         hidden=hidden,
-        **{key: _text(test.get(key)) for key in shown},
+        **words,
     )
 
 

@@ -112,10 +112,6 @@ class LinearQuadratic:
         return Batch(*(torch.as_tensor(part, dtype=torch.float32) for part in parts))
 
 
-CART = LinearQuadratic(np.array([[0.9]]), np.array([[0.5]]), np.array([[1.0]]), np.array([[0.3]]), gamma=0.9)
-"""x' = 0.9 x + 0.5 u, reward -(x^2 + 0.3 u^2): the problem of the homework's first figure."""
-
-
 def random_batch(generator: torch.Generator, size: int, obs_dim: int, act_dim: int, ended: float = 0.3) -> Batch:
     """Return transitions without meaning; a share ``ended`` of them is terminated."""
     return Batch(
