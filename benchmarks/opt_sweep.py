@@ -16,7 +16,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from robotbrain.jetson.plot_style import save
+from robotbrain.figures import save
 from robotbrain.jetson.tables import format_table
 from robotbrain.optimisation.data import scenes
 from robotbrain.optimisation.evaluate import mean_iou

@@ -14,15 +14,19 @@ from nbclient import NotebookClient
 from robotbrain import notebooks
 from robotbrain.grading import Lab, Report, load_suite
 
+REPO = Path(__file__).resolve().parents[1]
+WATCH = """
+import sys
+sys.path.insert(0, {repo!r})
+from tests.seeing import Watch
+watch_ = Watch()
+del sys.path[0]
+"""
 LONGEST = 25  # lines of a cell in a lesson
-PARTS = (
-    "You will be able to",
-    "**Time:**",
-    "## Summary",
-    "**Further reading.**",
-    "## Going to the real hardware",
-    "## What changed since the course outline",
-)
+SECTIONS = ("What changed since the course outline", "Going to the real hardware", "Summary")
+LONGEST_OPENING = 5 * 200  # words that are read in five minutes
+MOVING = re.compile(r"<iframe|<video|<animate|@keyframes|animation-duration")
+"""What moves in an output: a replay in 3D, a film, an animated drawing."""
 
 
 def execute(path: Path, claims: str = "", timeout: int = 90) -> Any:
@@ -30,12 +34,12 @@ def execute(path: Path, claims: str = "", timeout: int = 90) -> Any:
 
     Args:
         path: of the notebook.
-        claims: what the prose says about results, as code: it runs as a last cell.
+        claims: what the prose says about results, as code: it runs as a last cell, after the figures are looked at.
         timeout: of a cell, s.
     """
     notebook = nbformat.read(path, as_version=4)
-    if claims:
-        notebook.cells.append(nbformat.v4.new_code_cell(claims))
+    notebook.cells.insert(0, nbformat.v4.new_code_cell(WATCH.format(repo=str(REPO))))
+    notebook.cells.append(nbformat.v4.new_code_cell("watch_.ask()\n" + claims))
     NotebookClient(notebook, timeout=timeout, resources={"metadata": {"path": str(path.parent)}}).execute()
     return notebook
 
@@ -72,13 +76,46 @@ def check_form(path: Path, exercises: str) -> None:
             assert len(lines) <= LONGEST, cell.id
             assert max(map(len, lines)) <= 120, cell.id
     text = "\n".join(cell.source for cell in lesson.cells if cell.cell_type == "markdown")
-    for part in PARTS:
-        assert part in text, part
+    check_parts(lesson.cells, text)
     assert set(re.findall(r"Exercise (\d)", text)) == set(exercises)
     for target in re.findall(r"\]\(([^)#:]+\.(?:ipynb|svg|png))\)", text):
         assert (path.parent / target).is_file(), target
     for alt, target in re.findall(r"!\[(.*?)\]\((.*?)\)", text):
         assert len(alt) > 40, target
+
+
+def check_parts(cells: list[Any], text: str) -> None:
+    """Objectives, time, the sections that every lesson has and sources are there, and exercises have their checks."""
+    opening = cells[0].source
+    assert re.match(r"# \S", opening)
+    assert len(re.findall(r"^\d\. ", opening.partition("You will be able to")[2], flags=re.MULTILINE)) >= 4
+    assert "**Time:** about" in opening and "cells themselves run in under" in opening
+    sections = re.findall(r"^## (.+)$", text, flags=re.MULTILINE)
+    assert set(SECTIONS) <= set(sections) and sections[-1] == "Summary"
+    summary = text.partition("## Summary")[2]
+    assert len(re.findall(r"^\* ", summary, flags=re.MULTILINE)) >= 3
+    reading = summary.partition("**Further reading.**")[2]
+    assert len(re.findall(r"\]\(https?://", reading)) >= 3
+    for number, cell in enumerate(cells):
+        if cell.cell_type == "markdown" and re.search(r"^#+ Exercise \d", cell.source, flags=re.MULTILINE):
+            following = cells[number + 1 : number + 4]  # what is to be done, and the check
+            assert any("lab.check(" in c.source for c in following if c.cell_type == "code"), cell.id
+
+
+def check_motivation(executed: Any) -> None:
+    """A lesson begins with something that moves, in a section that takes five minutes at most."""
+    words, moving, sections = 0, False, 0
+    for cell in executed.cells:
+        if cell.cell_type == "markdown":
+            sections += len(re.findall(r"^## ", cell.source, flags=re.MULTILINE))
+            words += len(cell.source.split()) if sections < 2 else 0
+            if re.search(r"^#+ Exercise", cell.source, flags=re.MULTILINE):
+                break
+        elif any(MOVING.search(output.get("data", {}).get("text/html", "")) for output in cell.outputs):
+            moving = True
+            break
+    assert moving and sections <= 2, "nothing moves before the first exercise"
+    assert words <= LONGEST_OPENING
 
 
 def check_silent(executed: Any) -> None:
@@ -154,6 +191,9 @@ class LessonTests:
 
     def test_it_runs_from_the_top_and_says_nothing_on_stderr(self, executed: Any) -> None:
         check_silent(executed)
+
+    def test_it_begins_with_something_that_moves(self, executed: Any) -> None:
+        check_motivation(executed)
 
     def test_every_figure_and_table_can_be_read_by_everybody(self, executed: Any) -> None:
         check_readable(executed, self.figures, self.tables)

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 LONGEST_CELL = 40  # lines of code that still fit on a screen with what they do
 _ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
+_STATED = re.compile(r"\bcells themselves run in under (?P<number>\d+) (?P<unit>seconds|minutes)")
 _KERNEL = {"display_name": "Python 3 (ipykernel)", "language": "python", "name": "python3"}
 _KEPT_NOTEBOOK_METADATA = {"robotbrain", "title", "authors"}
 _VOLATILE_CELL_METADATA = {
@@ -125,6 +126,18 @@ def fix(path: Path) -> bool:
         return False
     write_text(path, canonical)
     return True
+
+
+def stated_seconds(path: Path) -> float | None:
+    """Return how long a notebook says that its cells run, in s, or None where it does not say.
+
+    It says so in one form, so that tests and pages can read it: "The cells themselves run in under 40 seconds."
+    """
+    _, notebook = read(path)
+    for cell in notebook.cells:
+        if cell.cell_type == "markdown" and (found := _STATED.search(cell.source)):
+            return int(found["number"]) * (60.0 if found["unit"] == "minutes" else 1.0)
+    return None
 
 
 def find(paths: Iterable[str | Path]) -> list[Path]:

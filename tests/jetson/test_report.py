@@ -13,8 +13,8 @@ import pytest
 from twin_builders import quick_run
 
 from robotbrain.errors import InputError
+from robotbrain.figures import alt_text
 from robotbrain.jetson import report
-from robotbrain.jetson.plot_style import alt_text
 from robotbrain.jetson.report import architecture, report_html, transfer_baseline, write_report
 from robotbrain.jetson.report_figures import coverage, plot_groups, plot_power, plot_scatter
 from robotbrain.jetson.twin.calibrate import CalibrationRun

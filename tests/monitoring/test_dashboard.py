@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import pytest
 
 from robotbrain.errors import InputError
-from robotbrain.jetson.plot_style import alt_text
+from robotbrain.figures import alt_text
 from robotbrain.monitoring import dashboard as module
 from robotbrain.monitoring.commands import monitor_arguments, monitor_main
 from robotbrain.monitoring.dashboard import Dashboard, plot_dashboard, snapshot_text, snapshots_of

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from robotbrain.errors import InputError
-from robotbrain.jetson.plot_style import alt_text
+from robotbrain.figures import alt_text
 from robotbrain.monitoring import plots
 from robotbrain.monitoring.metrics import measure
 from robotbrain.monitoring.report import report_html, write_report

@@ -81,10 +81,14 @@ class CpuHost:
 
 def list_modules() -> list[str]:
     """Return the slugs of all modules, sorted by family, then by power, then by name."""
+    return [module.slug for module in all_modules()]
+
+
+def all_modules() -> list[Module]:
+    """Return all modules in the order of :func:`list_modules`."""
     order = list(FAMILIES)
-    modules = [load_module(path.stem) for path in module_directory().glob("*.toml")]
-    ranked = sorted(modules, key=lambda m: (order.index(m.family), m.max_power_w, m.memory_gb, m.slug))
-    return [module.slug for module in ranked]
+    modules = [read_module(path) for path in module_directory().glob("*.toml")]
+    return sorted(modules, key=lambda m: (order.index(m.family), m.max_power_w, m.memory_gb, m.slug))
 
 
 def load_module(slug: str) -> Module:

@@ -8,7 +8,7 @@ import json
 from collections.abc import Iterable
 from typing import Any
 
-from robotbrain.jetson.catalogue import Module, list_modules, load_module
+from robotbrain.jetson.catalogue import Module, all_modules, list_modules, load_module
 from robotbrain.jetson.figures import Figure, Statement
 from robotbrain.jetson.modes import PowerMode
 from robotbrain.jetson.software import Headline, JetPack, compatible, jetpacks_for, load_headlines, load_jetpacks
@@ -22,7 +22,7 @@ def list_arguments(parser: argparse.ArgumentParser) -> None:
 
 def list_main(arguments: argparse.Namespace) -> int:
     """Print all modules."""
-    modules = [load_module(slug) for slug in list_modules()]
+    modules = all_modules()
     if arguments.json:
         _print_json({"modules": [_summary(module) for module in modules]})
         return 0

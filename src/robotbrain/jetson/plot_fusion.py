@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from robotbrain.errors import InputError
+from robotbrain.figures import BLUE, GREEN, INK, MAUVE, QUIET, SKY, VERMILLION, new_figure, text_on, title
 from robotbrain.jetson.graph import analyse
-from robotbrain.jetson.plot_style import INK, QUIET, new_figure, title
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -18,21 +18,21 @@ if TYPE_CHECKING:
     from robotbrain.jetson.kernels import KernelGraph
 
 NODES: dict[str, tuple[str, str]] = {
-    "Conv": ("C", "#56B4E9"),
-    "Relu": ("R", "#F0E442"),
-    "Resize": ("U", "#E69F00"),
-    "Concat": ("J", "#CC79A7"),
-    "QuantizeLinear": ("Q", "#009E73"),
-    "DequantizeLinear": ("D", "#8FD1B9"),
+    "Conv": ("C", "#B9DDF6"),
+    "Relu": ("R", "#FFF6B0"),
+    "Resize": ("U", "#F7D9B8"),
+    "Concat": ("J", "#E3C8DA"),
+    "QuantizeLinear": ("Q", "#A9D8C6"),
+    "DequantizeLinear": ("D", "#D5EEE4"),
 }
-"""Letter and colour of an operator; others are grey without a letter."""
+"""Letter and tint of an operator; others are grey without a letter."""
 
 KERNELS: dict[str, tuple[str, str]] = {
-    "conv": ("convolution", "#0072B2"),
-    "dw": ("depthwise convolution", "#56B4E9"),
-    "mm": ("matrix product", "#009E73"),
-    "pw": ("pointwise", "#CC79A7"),
-    "mem": ("data movement", "#D55E00"),
+    "conv": ("convolution", BLUE),
+    "dw": ("depthwise convolution", SKY),
+    "mm": ("matrix product", GREEN),
+    "pw": ("pointwise", MAUVE),
+    "mem": ("data movement", VERMILLION),
 }
 """Name and colour of a class of kernels."""
 
@@ -107,7 +107,7 @@ def _draw(axes: Axes, nodes: list[tuple[str, int | None]], graph: KernelGraph) -
         colour = KERNELS[graph.kernels[home].op.partition(":")[0]][1]
         first, last = min(places), max(places) + 1
         axes.add_patch(_box(first, 0.0, last - first, 0.75, colour, 1.0))
-        axes.text((first + last) / 2, 0.37, f"{home + 1}", ha="center", va="center", fontsize=8, color="white")
+        axes.text((first + last) / 2, 0.37, f"{home + 1}", ha="center", va="center", fontsize=8, color=text_on(colour))
         for place in places:
             axes.plot([place + 0.5, place + 0.5], [0.78, 1.37], color=QUIET, lw=0.8)
 

@@ -9,7 +9,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robotbrain.errors import InputError
-from robotbrain.jetson.plot_style import INK, QUIET, new_figure, plain_ticks, tidy, title
+from robotbrain.figures import (
+    BLUE,
+    GREEN,
+    GREY,
+    INK,
+    MAUVE,
+    QUIET,
+    SKY,
+    VERMILLION,
+    new_figure,
+    plain_ticks,
+    tidy,
+    title,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -19,11 +32,11 @@ if TYPE_CHECKING:
     from robotbrain.jetson.twin.runtime import ThermalModel, ThermalTrace
 
 FAMILY_STYLE: dict[str, tuple[str, str]] = {
-    "maxwell": ("#D55E00", "v"),
-    "pascal": ("#E69F00", "^"),
-    "volta": ("#009E73", "s"),
-    "ampere": ("#0072B2", "o"),
-    "blackwell": ("#CC79A7", "D"),
+    "maxwell": (VERMILLION, "v"),
+    "pascal": (SKY, "^"),
+    "volta": (GREEN, "s"),
+    "ampere": (BLUE, "o"),
+    "blackwell": (MAUVE, "D"),
 }
 """Colour and marker by family of GPUs."""
 
@@ -86,7 +99,7 @@ def _energy_lines(axes: Axes) -> None:
     (x0, x1), (y0, y1) = axes.get_xlim(), axes.get_ylim()
     for decade in range(math.floor(math.log10(x0 * y0)), math.ceil(math.log10(x1 * y1)) + 1):
         energy = 10.0**decade
-        axes.plot([x0, x1], [energy / x0, energy / x1], color="#9a9a9a", lw=0.8, ls=":", zorder=1)
+        axes.plot([x0, x1], [energy / x0, energy / x1], color=GREY, lw=0.8, ls=":", zorder=1)
         # The label stands where the line leaves: at the lower edge, else at the right one.
         leaves_below = energy / y0 < x1
         at = (energy / y0, y0) if leaves_below else (x1, energy / x1)
@@ -152,7 +165,7 @@ def _device_legend(axes: Axes, order: Sequence[Prediction]) -> None:
         Line2D([], [], ls="", marker=FAMILY_STYLE[f][1], color=FAMILY_STYLE[f][0], ms=7, label=f.capitalize())
         for f in families
     ]
-    handles.append(Line2D([], [], ls=":", color="#9a9a9a", label="equal energy"))
+    handles.append(Line2D([], [], ls=":", color=GREY, label="equal energy"))
     if not all(p.fits for p in order):
         handles.append(Line2D([], [], ls="", marker="o", mfc="white", color=INK, ms=7, label="out of memory"))
     axes.legend(
@@ -173,15 +186,15 @@ def plot_heat(trace: ThermalTrace, model: ThermalModel | None = None, subject: s
     top, middle, bottom = figure.subplots(3, 1, sharex=True, height_ratios=(2.2, 1.0, 1.0))
     unit, scale = ("min", 60.0) if trace.time_s[-1] > 300 else ("s", 1.0)
     t = trace.time_s / scale
-    top.plot(t, trace.temperature_c, color="#D55E00", lw=1.8, label="chip")
+    top.plot(t, trace.temperature_c, color=VERMILLION, lw=1.8, label="chip")
     if model is not None:
         trips = (("clocks are lowered", model.throttle_c, "--"), ("shutdown", model.shutdown_c, "-"))
         for name, value, dashes in trips:
             if value < max(trace.temperature_c) + 25:
                 top.axhline(value, color=INK, lw=1, ls=dashes, label=f"{name} at {value:g} °C")
         top.axhline(model.ambient_c, color=QUIET, lw=1, ls=":", label=f"air, {model.ambient_c:g} °C")
-    middle.step(t, 100 * trace.clock, where="post", color="#0072B2", lw=1.5)
-    bottom.step(t, trace.power_w, where="post", color="#009E73", lw=1.5)
+    middle.step(t, 100 * trace.clock, where="post", color=BLUE, lw=1.5)
+    bottom.step(t, trace.power_w, where="post", color=GREEN, lw=1.5)
     top.set_ylabel("temperature (°C)")
     middle.set_ylabel("GPU clock (%)")
     middle.set_ylim(0, 108)
@@ -192,8 +205,8 @@ def plot_heat(trace: ThermalTrace, model: ThermalModel | None = None, subject: s
     for axes in (top, middle, bottom):
         tidy(axes)
         axes.fill_between(
-            t, 0, 1, where=trace.clock < 1.0, step="post", transform=axes.get_xaxis_transform(), color="#F0E442",
-            alpha=0.3, lw=0, label="clocks lowered" if axes is top and trace.throttled_s > 0 else None,
+            t, 0, 1, where=trace.clock < 1.0, step="post", transform=axes.get_xaxis_transform(), color=VERMILLION,
+            alpha=0.15, lw=0, label="clocks lowered" if axes is top and trace.throttled_s > 0 else None,
         )  # fmt: skip
     top.legend(fontsize=8, loc="lower right", framealpha=0.9, edgecolor="#cccccc")
     title(top, f"Heat{': ' + subject if subject else ''}")

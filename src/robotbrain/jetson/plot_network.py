@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robotbrain.figures import BLUE, GREY, INK, MAUVE, QUIET, SKY, new_figure, plain_ticks, tidy, title
 from robotbrain.jetson.kernels import PRECISIONS
-from robotbrain.jetson.plot_style import INK, QUIET, new_figure, plain_ticks, tidy, title
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from robotbrain.jetson.twin.prediction import KernelTime, Prediction
 
 BOUNDS: dict[str, tuple[str, str]] = {
-    "compute": ("#0072B2", "o"),
-    "memory": ("#E69F00", "s"),
-    "launch": ("#CC79A7", "^"),
+    "compute": (BLUE, "o"),
+    "memory": (SKY, "s"),
+    "launch": (MAUVE, "^"),
 }
 """Colour and marker by what bounds a kernel."""
 
@@ -33,7 +33,6 @@ LANES: dict[str, str] = {
 }
 """Rows of the timeline, by class of kernel."""
 
-_LAUNCH_GREY = "#B8B8B8"
 _NUMBERED = 5
 
 
@@ -227,7 +226,7 @@ def _draw_timeline(figure: Figure | SubFigure, prediction: Prediction) -> str:
     lanes = [kind for kind in LANES if kind in kinds]
     height = 0.72
     axes.broken_barh(
-        list(zip(begin.tolist(), launch.tolist(), strict=True)), (-height / 2, height), facecolors=_LAUNCH_GREY, lw=0,
+        list(zip(begin.tolist(), launch.tolist(), strict=True)), (-height / 2, height), facecolors=GREY, lw=0,
         label=f"launches ({launch.sum():.3g} ms)",
     )  # fmt: skip
     axes.broken_barh([(0.0, prediction.fixed_ms)], (-height / 2, height), facecolors="#555555", lw=0)
@@ -282,7 +281,7 @@ def _timeline_legend(axes: Axes, prediction: Prediction, launch_ms: float) -> No
 
     handles = [Patch(color=colour, label=f"bound by {bound}") for bound, (colour, _) in BOUNDS.items()]
     handles += [
-        Patch(color=_LAUNCH_GREY, label=f"launches, {launch_ms:.3g} ms"),
+        Patch(color=GREY, label=f"launches, {launch_ms:.3g} ms"),
         Patch(color="#555555", label=f"start of an inference, {prediction.fixed_ms:.3g} ms"),
     ]
     axes.legend(

@@ -12,11 +12,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from robotbrain.errors import InputError
+from robotbrain.figures import PALETTE
 from robotbrain.jetson.tables import short
 from robotbrain.jetson.twin.prediction import Prediction
-
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
-"""Okabe and Ito's colours, which the colour-blind tell apart; names and numbers stand beside each all the same."""
 
 SLOW_MOTION = 50.0
 """How many times slower than in reality it plays, unless told otherwise."""
@@ -79,7 +77,7 @@ class Race:
 
     def _lane(self, index: int, prediction: Prediction) -> str:
         middle = index * _LANE + _LANE / 2
-        colour = COLOURS[index % len(COLOURS)]
+        colour = PALETTE[index % len(PALETTE)]
         # The bar is the rate: as long as the track for the fastest.
         share = min(p.latency_ms for p in self.predictions) / prediction.latency_ms
         seconds = prediction.latency_ms * self.slow_motion / 1e3

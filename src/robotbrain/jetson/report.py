@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robotbrain.errors import InputError
+from robotbrain.figures import to_html
 from robotbrain.files import write_text
 from robotbrain.jetson import report_figures as figures
 from robotbrain.jetson.catalogue import list_modules, load_module
-from robotbrain.jetson.plot_style import to_html
 from robotbrain.jetson.report_words import LIMITS, NOTES, PAGE
 from robotbrain.jetson.twin.calibrate import CalibrationRun, group_summaries
 from robotbrain.jetson.twin.conditions import PRECISIONS

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from robotbrain.figures import GREY, INK, QUIET, SKY, VERMILLION, new_figure, plain_ticks, tidy, title
 from robotbrain.jetson.catalogue import load_module
 from robotbrain.jetson.plot_modules import FAMILY_STYLE
-from robotbrain.jetson.plot_style import INK, QUIET, new_figure, plain_ticks, tidy, title
 from robotbrain.jetson.twin.data import PowerRow
 from robotbrain.jetson.twin.validate import LeftOut, group_of, interval_scale
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_BAND = "#56B4E9"
+_BAND = SKY
 
 
 def _families(items: Sequence[LeftOut]) -> list[str]:
@@ -76,7 +76,7 @@ def plot_groups(items: Sequence[LeftOut], limit: float = 0.6) -> Figure:
         chosen = [item for item in items if group_of(item.row) == group]
         colour, marker = FAMILY_STYLE[chosen[0].row.where.family]
         baseline = [item.baseline_error for item in chosen if not math.isnan(item.baseline_error)]
-        _errors(axes, baseline, y - 0.22, "#9a9a9a", "x", 14, limit)
+        _errors(axes, baseline, y - 0.22, GREY, "x", 14, limit)
         _errors(axes, [item.error for item in chosen], y + 0.12, colour, marker, 30, limit)
     axes.set_yticks(range(len(groups)), [" ".join((g[2], g[0], g[1])) for g in groups], fontsize=8.5)
     axes.set_ylim(-0.7, len(groups) - 0.3)
@@ -126,7 +126,7 @@ def plot_coverage(items: Sequence[LeftOut]) -> Figure:
     axes.axvline(80, color=QUIET, lw=0.9, ls=":")
     axes.fill_between([77, 83], 75, 90, color=_BAND, alpha=0.35, lw=0, label="wanted at 80 %")
     axes.plot(
-        [100 * share for share in nominal], [100 * share for share in seen], "o-", color="#D55E00", ms=5, lw=1.4,
+        [100 * share for share in nominal], [100 * share for share in seen], "o-", color=VERMILLION, ms=5, lw=1.4,
         label="left-out rows",
     )  # fmt: skip
     axes.set(xlim=(0, 100), ylim=(0, 100), aspect="equal")

@@ -50,7 +50,7 @@ def plot_dashboard(snapshots: Sequence[Snapshot], *, most: int = _SHOWN) -> Figu
         snapshots: oldest first.
         most: lines in a panel.
     """
-    from robotbrain.jetson.plot_style import new_figure
+    from robotbrain.figures import INK, new_figure
 
     alarms = snapshots[-1].alarms if snapshots else ()
     figure = new_figure(13.5, 5.8 + 0.22 * min(3, len(alarms)))
@@ -65,21 +65,23 @@ def plot_dashboard(snapshots: Sequence[Snapshot], *, most: int = _SHOWN) -> Figu
         axes.set_xlabel("time (s)")
     if alarms:
         more = f"  (and {len(alarms) - 3} more)" if len(alarms) > 3 else ""
-        figure.suptitle("⚠ " + "\n⚠ ".join(alarms[:3]) + more, color="#D55E00", fontsize=10, ha="left", x=0.01)
+        figure.suptitle(
+            "⚠ " + "\n⚠ ".join(alarms[:3]) + more, color=INK, fontweight="bold", fontsize=10, ha="left", x=0.01
+        )
     span = f"{snapshots[0].time_s:.0f} to {snapshots[-1].time_s:.0f} s. " if snapshots else "Nothing to show yet. "
     said = "; ".join(word for word in words if word)
     figure.set_label(f"Dashboard, {span}{said}. " + ("Alarms: " + "; ".join(alarms) if alarms else "No alarm."))
     return figure
 
 
-def _style(index: int) -> tuple[str, str]:
-    from robotbrain.monitoring.plots import PALETTE
+def _style(index: int) -> tuple[str, Any]:
+    from robotbrain.figures import LINES, PALETTE
 
-    return PALETTE[index % len(PALETTE)], ("-", "--", ":", "-.")[index % 4]
+    return PALETTE[index % len(PALETTE)], LINES[index % len(LINES)]
 
 
 def _finish(axes: Axes, heading: str, legend: bool = True) -> None:
-    from robotbrain.jetson.plot_style import tidy, title
+    from robotbrain.figures import tidy, title
 
     tidy(axes)
     title(axes, heading)
@@ -98,7 +100,7 @@ def _glances(axes: Axes, snapshots: Sequence[Snapshot], field: str, heading: str
         colour, line = _style(index)
         found = [(s.time_s, getattr(s, field)[name]) for s in snapshots if name in getattr(s, field)]
         times = [t for t, _ in found]
-        axes.plot(times, [g.p50_ms for _, g in found], line, color=colour, lw=1.6, label=_short(name))
+        axes.plot(times, [g.p50_ms for _, g in found], ls=line, color=colour, lw=1.6, label=_short(name))
         axes.fill_between(times, [g.p50_ms for _, g in found], [g.p99_ms for _, g in found], color=colour, alpha=0.15)
     _finish(axes, f"{heading}: median, band up to 99 %")
     return "; ".join(f"{name}: median {known[name].p50_ms:.1f} ms, 99 % {known[name].p99_ms:.1f} ms" for name in chosen)
@@ -118,12 +120,14 @@ def _rates(axes: Axes, snapshots: Sequence[Snapshot], most: int) -> str:
     for index, topic in enumerate(chosen):
         colour, line = _style(index)
         points = [(s.time_s, s.topics[topic]) for s in snapshots if topic in s.topics]
-        axes.plot(*zip(*points, strict=True), line, color=colour, lw=1.6, label=topic)
+        axes.plot(*zip(*points, strict=True), ls=line, color=colour, lw=1.6, label=topic)
     _finish(axes, "messages a second (Hz)")
     return ", ".join(f"{topic} {newest[topic]:.1f} Hz" for topic in chosen)
 
 
 def _use(axes: Axes, snapshots: Sequence[Snapshot]) -> str:
+    from robotbrain.figures import QUIET
+
     series: dict[str, list[tuple[float, float]]] = {}
     for snapshot in snapshots:
         for name, share in snapshot.utilisation.items():
@@ -133,7 +137,7 @@ def _use(axes: Axes, snapshots: Sequence[Snapshot]) -> str:
                 series.setdefault(label, []).append((snapshot.time_s, snapshot.resources[name]))
     for index, (name, points) in enumerate(series.items()):
         colour, line = _style(index)
-        axes.plot(*zip(*points, strict=True), line, color=colour, lw=1.6, label=name)
+        axes.plot(*zip(*points, strict=True), ls=line, color=colour, lw=1.6, label=name)
     extra = []
     if snapshots:
         resources = snapshots[-1].resources
@@ -142,12 +146,13 @@ def _use(axes: Axes, snapshots: Sequence[Snapshot]) -> str:
     _finish(axes, "busy (%)" + (", now " + ", ".join(extra) if extra else ""))
     axes.set_ylim(0, 105)
     if not series:
-        axes.text(0.5, 0.5, "no source of resources", transform=axes.transAxes, ha="center", color="#6b6b6b")
+        axes.text(0.5, 0.5, "no source of resources", transform=axes.transAxes, ha="center", color=QUIET)
     return ", ".join(f"{name} {points[-1][1]:.0f} %" for name, points in series.items())
 
 
 def snapshot_text(snapshot: Snapshot, most: int = _SHOWN) -> str:
     """Return a snapshot as a few lines for a terminal."""
+
     lines = [f"t = {snapshot.time_s:.1f} s"]
     for name, glance in snapshot.chains.items():
         lines.append(f"  {name}: median {glance.p50_ms:.0f} ms, 99 % {glance.p99_ms:.0f} ms")
@@ -263,10 +268,10 @@ class Dashboard:
 
     def markup(self, snapshots: Sequence[Snapshot]) -> str:
         """Return the picture as HTML, with its alternative text."""
-        from robotbrain.jetson.plot_style import to_html
+        from robotbrain.figures import to_html
 
         head = f"<b>t = {snapshots[-1].time_s:.1f} s</b>" if snapshots else "<b>waiting for the first snapshot</b>"
-        trouble = f" <span style='color:#D55E00'>{html.escape(self.problem)}</span>" if self.problem else ""
+        trouble = f" <strong>{html.escape(self.problem)}</span>" if self.problem else ""
         return f"<div>{head}{trouble}<br>{to_html(plot_dashboard(snapshots), dpi=100)}</div>"
 
     # ------------------------------------------------------------ live

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from robotbrain.jetson.plot_style import INK, QUIET, new_figure, tidy, title
+from robotbrain.figures import BLUE, INK, QUIET, SKY, VERMILLION, new_figure, tidy, title
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -12,8 +12,10 @@ if TYPE_CHECKING:
 
     from robotbrain.monitoring.diagnosis import Diagnosis
 
-WORK, WAIT, LIMIT = "#0072B2", "#E69F00", "#D55E00"
-"""Colours of work done, of waiting, and of the bottleneck (Okabe and Ito's palette)."""
+WORK: dict[str, Any] = {"color": BLUE}
+WAIT: dict[str, Any] = {"color": SKY}
+LIMIT: dict[str, Any] = {"facecolor": VERMILLION, "edgecolor": "white", "hatch": "////"}
+"""How bars of work done, of waiting and of the bottleneck look."""
 
 WORKING = ("slow node", "slow inference", "slow service", "oversized input")
 
@@ -41,8 +43,8 @@ def _waterfall(axes: Axes, diagnosis: Diagnosis, count: int) -> None:
     begin, labels = 0.0, []
     total = diagnosis.before.mean_ms
     for row, cause in enumerate(diagnosis.causes[:count]):
-        colour = LIMIT if row == 0 else WORK if cause.kind in WORKING else WAIT
-        axes.barh(row, cause.mean_ms, left=begin, color=colour, height=0.7)
+        style = LIMIT if row == 0 else WORK if cause.kind in WORKING else WAIT
+        axes.barh(row, cause.mean_ms, left=begin, height=0.7, **style)
         axes.text(begin + cause.mean_ms + 0.01 * total, row, f"{cause.mean_ms:.1f} ms", va="center", color=INK)
         begin += cause.mean_ms
         labels.append(cause.name)
@@ -53,7 +55,7 @@ def _waterfall(axes: Axes, diagnosis: Diagnosis, count: int) -> None:
     axes.invert_yaxis()
     axes.set_xlim(0, 1.15 * total)
     axes.set_xlabel(f"mean time from {diagnosis.before.source} to {diagnosis.before.sink} (ms, simulated)")
-    title(axes, "Where the latency goes (red: the bottleneck; blue: work; yellow: waiting)")
+    title(axes, "Where the latency goes (hatched: the bottleneck; dark: work; light: waiting)")
     tidy(axes)
 
 
@@ -69,13 +71,13 @@ def _busy(diagnosis: Diagnosis) -> list[tuple[str, float]]:
 
 def _bars(axes: Axes, busy: list[tuple[str, float]]) -> None:
     for row, (_, use) in enumerate(busy):
-        axes.barh(row, 100 * use, color=LIMIT if use > 0.9 else WORK, height=0.7)
+        axes.barh(row, 100 * use, height=0.7, **(LIMIT if use > 0.9 else WORK))
         axes.text(100 * use + 1.5, row, f"{use:.0%}", va="center", color=INK)
     axes.set_yticks(range(len(busy)), [name for name, _ in busy])
     axes.invert_yaxis()
     axes.set_xlim(0, 115)
     axes.set_xlabel("share of the time in use (%)")
-    title(axes, "What is busy (red: above 90 %)")
+    title(axes, "What is busy (hatched: above 90 %)")
     tidy(axes)
 
 

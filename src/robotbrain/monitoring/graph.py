@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from robotbrain.errors import InputError
+from robotbrain.figures import BLUE, VERMILLION, new_figure
 from robotbrain.monitoring.trace import Trace
 
 if TYPE_CHECKING:
@@ -73,7 +74,6 @@ def plot_graph(trace: Trace, nodes: Sequence[str] | None = None) -> Figure:
     Raises:
         InputError: for a run without messages, or ``nodes`` that leave one out or name one that is not there.
     """
-    from robotbrain.jetson.plot_style import new_figure
 
     shown = edges(trace)
     present = sorted({edge.source for edge in shown} | {edge.target for edge in shown})
@@ -106,7 +106,7 @@ def plot_graph(trace: Trace, nodes: Sequence[str] | None = None) -> Figure:
     return figure
 
 
-_TOPIC, _SERVICE = "#0072B2", "#D55E00"
+_TOPIC, _SERVICE = BLUE, VERMILLION
 
 
 def _order(link: tuple[str, str], shown: Sequence[Edge], rows: Sequence[str]) -> tuple[int, int, str]:

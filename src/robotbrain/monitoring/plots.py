@@ -1,20 +1,35 @@
 """Figures of a run: what happened when, how long things took, what waited, what was busy.
 
 Each returns a matplotlib figure whose label says in words what it shows
-(:func:`robotbrain.jetson.plot_style.alt_text`). Colours are those of Okabe and Ito, which the colour-blind can tell
-apart; lines and marks differ too.
+(:func:`robotbrain.figures.alt_text`). Lines and marks differ besides their colours.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robotbrain.jetson.plot_style import INK, QUIET, new_figure, plain_ticks, tidy, title
+from robotbrain.figures import (
+    BLUE,
+    GREEN,
+    GREY,
+    INK,
+    LINES,
+    MAUVE,
+    PALETTE,
+    QUIET,
+    SKY,
+    VERMILLION,
+    new_figure,
+    plain_ticks,
+    text_on,
+    tidy,
+    title,
+)
 from robotbrain.monitoring.chains import ChainAges, chain_ages, main_chains, outside_nodes
 from robotbrain.monitoring.critical_path_device import lay_out
 from robotbrain.monitoring.deadlines import KIT_DEADLINES, Deadlines
@@ -30,17 +45,9 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-BLUE, ORANGE, GREEN, VERMILLION = "#0072B2", "#E69F00", "#009E73", "#D55E00"
-PURPLE, SKY, YELLOW, BLACK = "#CC79A7", "#56B4E9", "#F0E442", "#000000"
-PALETTE = (BLUE, ORANGE, GREEN, PURPLE, SKY, YELLOW, VERMILLION)
-"""Okabe and Ito's colours, in the order in which they are used here; vermillion comes last, since it also marks
-trouble."""
-GREY = "#9A9A9A"
-
 _CLIP = 100.0  # deviation, % of the period, from which nobody would call it periodic
-_LINES = ("-", "--", ":", "-.")
 _ROLE_ORDER = ("perception", "estimator", "mapper", "planner", "mission", "controller")
-_RESOURCES = {"cpu": (BLUE, "-"), "gpu": (ORANGE, "--"), "dla0": (GREEN, ":"), "dla1": (PURPLE, "-.")}
+_RESOURCES = {"cpu": (BLUE, "-"), "gpu": (VERMILLION, "--"), "dla0": (GREEN, ":"), "dla1": (MAUVE, "-.")}
 
 
 def node_order(trace: Trace) -> list[str]:
@@ -112,9 +119,8 @@ def plot_timeline(
             axes.plot([max(ready, 0), start], [y - 0.33] * 2, color=colour, lw=1.6, alpha=0.55, solid_capstyle="butt")
         axes.broken_barh([(start, stop - start)], (y - 0.24, 0.5), facecolor=colour, edgecolor=colour, lw=0.7)
         if stop - start > 0.085 * (end - begin) * 1e-6 and start >= 0 and stop <= (end - begin) * 1e-6:
-            dark = colour in (BLUE, VERMILLION, GREEN, BLACK)
             axes.text((start + stop) / 2, y, callback.name.lstrip("_"), ha="center", va="center", fontsize=8,
-                      color="white" if dark else INK, clip_on=True)  # fmt: skip
+                      color=text_on(colour), clip_on=True)  # fmt: skip
         limit = limits.of(callback.node, trace.roles.get(callback.node, ""), callback.kind, callback.name)
         if limit is not None and (callback.end_ns - callback.ready_ns) * 1e-6 > limit:
             late += 1
@@ -185,7 +191,7 @@ def plot_end_to_end(trace: Trace, chains: Iterable[Sequence[str]] | None = None)
             np.asarray(times, dtype=np.float64),
             found.known_ms,
             PALETTE[index % len(PALETTE)],
-            _LINES[index % 4],
+            LINES[index % len(LINES)],
             _chain_name(found),
         )
         words.append(
@@ -200,11 +206,11 @@ def plot_end_to_end(trace: Trace, chains: Iterable[Sequence[str]] | None = None)
     return figure
 
 
-def _age_line(axes: Axes, times: Array, ages: Array, colour: str, line: str, label: str) -> None:
+def _age_line(axes: Axes, times: Array, ages: Array, colour: str, line: Any, label: str) -> None:
     """Draw ages one by one, or, where they are many, their mean and range in short stretches of time."""
     bins = 60
     if len(times) <= 3 * bins:
-        axes.plot(times, ages, line, color=colour, lw=1.2, label=label)
+        axes.plot(times, ages, ls=line, color=colour, lw=1.2, label=label)
         return
     edges = np.linspace(times[0], times[-1], bins + 1)
     groups = np.clip(np.searchsorted(edges, times, side="right") - 1, 0, bins - 1)
@@ -213,7 +219,7 @@ def _age_line(axes: Axes, times: Array, ages: Array, colour: str, line: str, lab
     rows = [(t, v.mean(), v.min(), v.max()) for t, v in zip(middle, stretches, strict=True) if len(v)]
     when, mean, low, high = np.array(rows).T
     axes.fill_between(when, low, high, color=colour, alpha=0.22, lw=0)
-    axes.plot(when, mean, line, color=colour, lw=1.6, label=f"{label} (mean and range)")
+    axes.plot(when, mean, ls=line, color=colour, lw=1.6, label=f"{label} (mean and range)")
 
 
 def _chain_name(ages: ChainAges) -> str:
@@ -280,7 +286,7 @@ def plot_rhythm(summary: Summary, most: int = 14) -> Figure:
     axes = figure.subplots()
     for y, (_, jitter, rate) in enumerate(rows):
         p50, p95 = (100 * value / jitter.period_ms for value in (jitter.deviation.p50, jitter.deviation.p95))
-        axes.barh(y, min(p95, _CLIP), height=0.6, color=ORANGE)
+        axes.barh(y, min(p95, _CLIP), height=0.6, color=SKY)
         axes.barh(y, min(p50, _CLIP), height=0.28, color=BLUE)
         beyond = f"  not periodic: {p95:.0f} %," if p95 > _CLIP else " "
         axes.text(min(p95, _CLIP), y, f"{beyond} {rate:.1f} Hz", va="center", fontsize=8.5, color=QUIET)
@@ -290,7 +296,7 @@ def plot_rhythm(summary: Summary, most: int = 14) -> Figure:
     axes.set_xlim(0, _CLIP * 1.28 if longest > _CLIP else max(1.0, 1.15 * longest))
     tidy(axes)
     axes.tick_params(axis="y", length=0)
-    _legend(figure, [("median", BLUE, "s"), ("95th percentile", ORANGE, "s")])
+    _legend(figure, [("median", BLUE, "s"), ("95th percentile", SKY, "s")])
     worst = rows[-1] if rows else None
     said = "" if worst is None else f" The least regular is {worst[0]} at {worst[2]:.1f} Hz."
     figure.set_label(f"How regular {len(rows)} topics and timers are.{said}")
@@ -372,7 +378,7 @@ def plot_resources(trace: Trace, bin_s: float | None = None) -> Figure:
     if trace.capacity:
         times, shares = busy_over_time(trace, width)
         for name, share in shares.items():
-            colour, line = _RESOURCES.get(name, (BLACK, "-"))
+            colour, line = _RESOURCES.get(name, (INK, "-"))
             label = f"{_resource_name(name, trace)}, mean {100 * share.mean():.0f} %"
             axes.step(times, 100 * share, line, where="mid", color=colour, lw=1.3, label=label)
             words.append(f"{name} {100 * share.mean():.0f} % on average, at most {100 * share.max():.0f} %")

@@ -6,7 +6,7 @@ import html
 from collections.abc import Collection, Iterable, Sequence
 from typing import TYPE_CHECKING
 
-from robotbrain.jetson.plot_style import to_html
+from robotbrain.figures import to_html
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

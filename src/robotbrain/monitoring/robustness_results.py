@@ -147,25 +147,25 @@ class Robustness:
 
     def plot(self) -> tuple[Figure, str]:
         """Return a figure of success rate and latency by fault, and its alternative text."""
-        from robotbrain.jetson.plot_style import INK, new_figure, tidy, title
+        from robotbrain.figures import BLUE, INK, SKY, new_figure, tidy, title
 
         found = self.summaries
         names = [s.fault if s.fault == NOTHING else f"{s.fault}, {s.severity}" for s in found]
         figure = new_figure(11, 0.36 * len(found) + 1.3)
         left, right = figure.subplots(1, 2, sharey=True, width_ratios=(3, 2))
         for row, s in enumerate(found):
-            left.plot([100 * s.low, 100 * s.high], [row, row], color="#56B4E9", lw=4, solid_capstyle="butt")
-            left.plot(100 * s.rate, row, "o", color="#0072B2")
+            left.plot([100 * s.low, 100 * s.high], [row, row], color=SKY, lw=4, solid_capstyle="butt")
+            left.plot(100 * s.rate, row, "o", color=BLUE)
             left.text(103, row, f"{s.successes} of {s.runs}", va="center", color=INK)
             if math.isfinite(s.e2e_p99_ms):
-                right.barh(row, s.e2e_p99_ms, color="#0072B2", height=0.6)
-                right.barh(row, s.e2e_p50_ms, color="#E69F00", height=0.3)
+                right.barh(row, s.e2e_p99_ms, color=BLUE, height=0.6)
+                right.barh(row, s.e2e_p50_ms, color=SKY, height=0.3)
         left.set_yticks(range(len(found)), names)
         left.invert_yaxis()
         left.set_xlim(-3, 118)
         left.set_xticks(range(0, 101, 25))
         left.set_xlabel("worlds solved (%), 95 % interval")
-        right.set_xlabel("end-to-end latency (ms): blue p99, yellow median")
+        right.set_xlabel("end-to-end latency (ms): bar: p99; narrow bar in it: median")
         title(left, "What faults do to driving")
         tidy(left)
         tidy(right)

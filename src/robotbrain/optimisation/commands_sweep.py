@@ -73,7 +73,7 @@ def report_main(arguments: argparse.Namespace) -> int:
 
 
 def _report(rows: list[dict[str, Any]], folder: Path, module: str | None) -> None:
-    from robotbrain.jetson.plot_style import save
+    from robotbrain.figures import save
     from robotbrain.optimisation.sweep import best_row, clock_note, complete
     from robotbrain.optimisation.sweep_plots import plot_sweep
     from robotbrain.optimisation.sweep_report import table_rows, write_sweep_report

@@ -8,7 +8,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 from robotbrain.errors import InputError
-from robotbrain.jetson.plot_style import INK, QUIET, new_figure, plain_ticks, tidy, title
+from robotbrain.figures import BLUE, GREEN, INK, QUIET, VERMILLION, new_figure, plain_ticks, tidy, title
 from robotbrain.optimisation.sweep import NEAR, best_row, complete, front_of, latency_of
 
 if TYPE_CHECKING:
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 Row = Mapping[str, Any]
 
-COLOURS = {"fp32": "#0072B2", "int8": "#D55E00"}
-"""Okabe and Ito's blue and vermilion: told apart by any eye, and in grey."""
+COLOURS = {"fp32": BLUE, "int8": VERMILLION}
+"""By the type of the numbers."""
 
 PRECISION_WORDS = {"fp32": "no Q/DQ: FP32 here, FP16 on a Jetson", "int8": "INT8"}
 MARKERS = {"as it is": "o", "channels removed": "s", "zeros in the weights": "^", "another width": "D", "teacher": "*"}
@@ -181,7 +181,7 @@ def _panel(axes: Axes, rows: Sequence[Row], where: str) -> None:
     plain_ticks(axes, "x")
     axes.tick_params(labelsize=10)
     axes.set_xlabel("time of one inference (ms)", fontsize=11)
-    axes.axhspan(axes.get_ylim()[0], NEAR, color="#009E73", alpha=0.07, lw=0, zorder=0)
+    axes.axhspan(axes.get_ylim()[0], NEAR, color=GREEN, alpha=0.07, lw=0, zorder=0)
     place = axes.get_xlim()[1], axes.get_ylim()[0]
     words = f"at most {NEAR:g} point lost "
     axes.annotate(words, place, (0, 5), textcoords="offset points", ha="right", color="#00634A", fontsize=9)

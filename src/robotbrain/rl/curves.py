@@ -2,7 +2,7 @@
 
 One seed says little about a method: a curve is the median over trainings, with what lies around it. Colours, marks and
 words are those of the kit's other figures; each figure's label says in words what it shows
-(:func:`robotbrain.jetson.plot_style.alt_text`).
+(:func:`robotbrain.figures.alt_text`).
 """
 
 from __future__ import annotations
@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robotbrain.errors import InputError
-from robotbrain.jetson.plot_style import QUIET, alt_text, new_figure, save, tidy, title, to_html
+from robotbrain.figures import PALETTE, QUIET, alt_text, new_figure, save, tidy, title, to_html
 from robotbrain.monitoring.accuracy import Estimate
-from robotbrain.monitoring.plots import PALETTE
 from robotbrain.rl.logs import Run, Series, read_run
 
 if TYPE_CHECKING:

@@ -267,7 +267,7 @@ def gap_main(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print(report.save(arguments.json))
     if arguments.plot:
-        from robotbrain.jetson.plot_style import save
+        from robotbrain.figures import save
 
         print(save(report.plot(), arguments.plot))
     return 0

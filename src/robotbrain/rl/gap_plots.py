@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from robotbrain.jetson.plot_style import new_figure, tidy, title
+from robotbrain.figures import BLUE, BROWN, GREEN, MAUVE, QUIET, SKY, VERMILLION, new_figure, tidy, title
 from robotbrain.rl.gap_report import PLACES, GapReport
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-PLACE_STYLES = {"simulation": ("#0072B2", "o"), "surrogate": ("#D55E00", "s")}
-"""Okabe and Ito's blue and vermilion, and a marker."""
-VARIANT_COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
+PLACE_STYLES = {"simulation": (BLUE, "o"), "surrogate": (VERMILLION, "s")}
+"""Colour and marker by place."""
+VARIANT_COLOURS = (VERMILLION, BLUE, GREEN, MAUVE, SKY, BROWN)
 VARIANT_LINES = ("-", "--", "-.", ":")
 TOLERANCE_MM = 20.0
 _UNITS = {
@@ -70,7 +70,7 @@ def _plot_errors(axes: Axes, report: GapReport) -> None:
         share = 100 * np.arange(1, len(error) + 1) / len(error)
         colour, line = VARIANT_COLOURS[k % len(VARIANT_COLOURS)], VARIANT_LINES[k % len(VARIANT_LINES)]
         axes.step(error, share, where="post", color=colour, ls=line, lw=2, label=variant)
-    axes.axvline(TOLERANCE_MM, color="#6b6b6b", lw=0.8)
+    axes.axvline(TOLERANCE_MM, color=QUIET, lw=0.8)
     axes.set_xscale("log")
     axes.set_xlabel("final error (mm); grey: tolerance")
     axes.set_ylabel("surrogates with at most this error (%)")
@@ -94,9 +94,9 @@ def plot_sensitivity(report: GapReport, columns: int = 5) -> Figure:
             words.append(f"{variant} and {name}: {rho:+.2f}")
             colour = VARIANT_COLOURS[k % len(VARIANT_COLOURS)]
             label = variant if axes is panels.flat[0] else None
-            axes.plot(values[name], found, ls="", marker=marker, ms=3, alpha=0.6, color=colour, mec="none", label=label)
+            axes.plot(values[name], found, ls="", marker=marker, ms=3, color=colour, mec="none", label=label)
         axes.set_yscale("log")
-        axes.axhline(TOLERANCE_MM, color="#6b6b6b", lw=0.8)
+        axes.axhline(TOLERANCE_MM, color=QUIET, lw=0.8)
         axes.set_xlabel(
             f"{name.removesuffix('_s').replace('_', ' ')}" + (f" ({_UNITS[name]})" if name in _UNITS else "")
         )

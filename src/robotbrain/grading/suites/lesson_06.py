@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 import numpy as np
+from scipy.stats import t  # not within a test: an import that its time limit interrupts stays broken
 
 from robotbrain.grading import Suite, expect, fail
 from robotbrain.grading.suites.lesson_tools import answered
@@ -129,8 +130,6 @@ def _student_interval(values: Any, quantile: float, ddof: int = 1, root: bool = 
 
 @suite.test("interval", points=3, name="against scipy's", reread="Exercise 2")
 def _interval(student: Any) -> None:
-    from scipy.stats import t
-
     rng = student.rng("interval")
     for n in (5, 3, 8):
         values = rng.uniform(0.4, 1.0, n)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robotbrain.errors import InputError
-from robotbrain.jetson.catalogue import Module, list_modules, load_module
+from robotbrain.jetson.catalogue import Module, all_modules
 from robotbrain.jetson.figures import Figure, read_table
 from robotbrain.jetson.kernels import KernelGraph
 from robotbrain.jetson.paths import find_part
@@ -144,7 +144,7 @@ class ThermalModel:
 def _cooled_for_w(module: Module) -> float:
     """Return the power that the developer kit's heat sink is made for: the Super variants are the same hardware."""
     base = module.slug.removesuffix("-super")
-    twins = [load_module(slug) for slug in (base, f"{base}-super") if slug in list_modules()]
+    twins = [twin for twin in all_modules() if twin.slug in (base, f"{base}-super")]
     return max(twin.max_power_w for twin in [module, *twins])
 
 

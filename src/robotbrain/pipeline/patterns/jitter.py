@@ -195,7 +195,7 @@ def kernel_is_realtime() -> bool | None:
         return None
     flag = Path("/sys/kernel/realtime")
     try:
-        return flag.read_text().strip() == "1"
+        return flag.read_text(encoding="utf-8").strip() == "1"
     except OSError:
         return "PREEMPT_RT" in os.uname().version
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robotbrain.errors import InputError
-from robotbrain.jetson.plot_style import INK, QUIET, new_figure, tidy, title
+from robotbrain.figures import BLUE, BROWN, GREEN, GREY, INK, MAUVE, QUIET, SKY, VERMILLION, new_figure, tidy, title
 from robotbrain.pipeline.patterns.ages import safe_speed
 from robotbrain.pipeline.patterns.jitter import JitterResult
 from robotbrain.pipeline.patterns.queues import QueueResult
@@ -31,7 +31,7 @@ __all__ = [
     "plot_timeline",
 ]
 
-LINES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#1B1B1B")
+LINES = (BLUE, VERMILLION, GREEN, MAUVE, BROWN, SKY, INK)
 """Colours of curves."""
 
 DASHES = ("-", (0, (5, 1.5)), (0, (1.2, 1.2)), (0, (6, 1.5, 1.2, 1.5)), (0, (3, 1)), (0, (8, 2)), (0, (2, 3)))
@@ -97,9 +97,9 @@ def plot_comparison(results: Sequence[PatternResult], *, labels: Sequence[str] |
     figure = new_figure(11, 0.5 * len(results) + 1.3)
     left, middle, right = figure.subplots(1, 3, sharey=True)
     panels: list[tuple[Axes, list[float], str, str]] = [
-        (left, [run.throughput_hz for run in results], "#009E73", "frames used per second"),
-        (middle, [float(run.latency_ms.mean()) for run in results], "#0072B2", "latency, mean (ms, simulated)"),
-        (right, [run.mean_age_ms for run in results], "#E69F00", "age at the actuator (ms, simulated)"),
+        (left, [run.throughput_hz for run in results], GREEN, "frames used per second"),
+        (middle, [float(run.latency_ms.mean()) for run in results], BLUE, "latency, mean (ms, simulated)"),
+        (right, [run.mean_age_ms for run in results], BROWN, "age at the actuator (ms, simulated)"),
     ]
     for axes, values, colour, label in panels:
         axes.barh(rows, values, height=0.62, color=colour)
@@ -189,11 +189,13 @@ def plot_queues(results: Sequence[QueueResult]) -> tuple[Figure, str]:
     rows = np.arange(len(results))[::-1]
     lost = [100 * run.lost / run.frames for run in results]
     used = [100 * len(run.outputs) / run.frames for run in results]
-    right.barh(rows, used, height=0.62, color="#009E73", label="worked off")
-    right.barh(rows, lost, height=0.62, left=used, color="#D55E00", hatch="////", edgecolor="white", lw=0, label="lost")
+    right.barh(rows, used, height=0.62, color=GREEN, label="worked off")
+    right.barh(
+        rows, lost, height=0.62, left=used, color=VERMILLION, hatch="////", edgecolor="white", lw=0, label="lost"
+    )
     waits = [max(0.0, 100 - a - b) for a, b in zip(used, lost, strict=True)]
     starts = [a + b for a, b in zip(used, lost, strict=True)]
-    right.barh(rows, waits, height=0.62, left=starts, color="#BBBBBB", label="still waiting")
+    right.barh(rows, waits, height=0.62, left=starts, facecolor="white", edgecolor=GREY, label="still waiting")
     right.set_yticks(rows, names)
     right.set(xlim=(0, 100), xlabel="frames taken by the camera (%)")
     for row, run in zip(rows, results, strict=True):
@@ -273,7 +275,7 @@ def plot_jitter(results: Sequence[JitterResult], *, labels: Sequence[str] | None
 
 
 def _plain(axes: Axes, *names: str) -> None:
-    from robotbrain.jetson.plot_style import plain_ticks
+    from robotbrain.figures import plain_ticks
 
     plain_ticks(axes, *(names or ("y",)))
 

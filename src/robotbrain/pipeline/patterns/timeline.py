@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from robotbrain.jetson.plot_style import INK, QUIET, new_figure, tidy, title
+from robotbrain.figures import BLUE, BROWN, GREEN, INK, MAUVE, QUIET, SKY, VERMILLION, new_figure, tidy, title
 from robotbrain.pipeline.patterns.results import PatternResult, Span
 from robotbrain.pipeline.patterns.stages import NS_PER_MS
 
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FRAME_STYLES = (
-    ("#0072B2", ""),
-    ("#E69F00", "////"),
-    ("#009E73", ""),
-    ("#CC79A7", "\\\\\\\\"),
-    ("#56B4E9", ""),
-    ("#D55E00", "...."),
+    (BLUE, ""),
+    (BROWN, "////"),
+    (GREEN, ""),
+    (MAUVE, "\\\\\\\\"),
+    (SKY, ""),
+    (VERMILLION, "...."),
 )
-"""Fill and hatch by frame, in turn (Okabe and Ito's colours; neighbours differ in lightness and hatch, too)."""
+"""Fill and hatch by frame, in turn (neighbours differ in lightness and hatch, too)."""
 
 OFF_CPU = "#FFFFFF"
 """Core of what does not run on the CPU."""

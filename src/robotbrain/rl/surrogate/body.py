@@ -154,28 +154,31 @@ class Kinematics:
 
     def __init__(self, body: Body, site: str = "ee") -> None:
         model = body.model
-        self._joint_of = {int(link): j for j, link in enumerate(body.links)}
-        self._axes = model.jnt_axis[[model.joint(name).id for name in body.joint_names]]
+        joint_of = {int(link): j for j, link in enumerate(body.links)}
+        axes = model.jnt_axis[[model.joint(name).id for name in body.joint_names]]
         self._zero = model.qpos0[body.qpos]
         self._tip = model.site(site).pos.copy()
-        chain: list[int] = []
+        joints, offsets, turns = [], [], []  # of each link, from the tip to the base
         at = int(model.site(site).bodyid[0])
         while at:
-            chain.append(at)
+            fixed, j = _rotation(model.body_quat[at]), joint_of.get(at)
+            cross = _cross(axes[j]) if j is not None else np.zeros((3, 3))
+            joints.append(j or 0)  # a link without a joint is turned by no angle: its cross product is 0
+            offsets.append(model.body_pos[at].copy())
+            turns.append([fixed.ravel(), (fixed @ cross).ravel(), (fixed @ cross @ cross).ravel()])
             at = int(model.body_parentid[at])
-        self._chain = [(i, model.body_pos[i].copy(), _rotation(model.body_quat[i])) for i in reversed(chain)]
+        self._joints, self._offsets, self._turns = joints, offsets, np.array(turns)
 
     def __call__(self, joint_pos: Array) -> Array:
         """Return the site's place in the base frame (m), (n, 3), for joint angles (rad), (n, J)."""
-        n = len(joint_pos)
-        turn, place = np.broadcast_to(np.eye(3), (n, 3, 3)), np.zeros((n, 3))
-        for link, offset, fixed in self._chain:
-            place = place + turn @ offset
-            turn = turn @ fixed
-            j = self._joint_of.get(link)
-            if j is not None:
-                turn = turn @ _turns(self._axes[j], joint_pos[:, j] - self._zero[j])
-        return np.asarray(place + turn @ self._tip)
+        angle = (joint_pos - self._zero).T[self._joints]
+        # Each link's turn by q about its axis: R (I + sin q K + (1 - cos q) K^2) (Rodrigues), for all links at once.
+        share = np.stack([np.ones_like(angle), np.sin(angle), 1.0 - np.cos(angle)], axis=-1)
+        turns = (share @ self._turns).reshape(*angle.shape, 3, 3)
+        place = np.broadcast_to(self._tip[:, None], (angle.shape[1], 3, 1))
+        for offset, turn in zip(self._offsets, turns, strict=True):
+            place = turn @ place + offset[:, None]
+        return np.asarray(place[..., 0])
 
 
 def _rotation(quaternion_wxyz: Array) -> Array:
@@ -184,9 +187,7 @@ def _rotation(quaternion_wxyz: Array) -> Array:
     return matrix.reshape(3, 3)
 
 
-def _turns(axis: Array, angle: Array) -> Array:
-    """Rotation matrices (n, 3, 3) about one unit axis (Rodrigues)."""
+def _cross(axis: Array) -> Array:
+    """The matrix of the cross product with ``axis``."""
     x, y, z = axis
-    k = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    s, c = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
-    return np.asarray(np.eye(3) + s * k + (1.0 - c) * (k @ k))
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -93,6 +93,7 @@ class SurrogateFleet:
             self.step_s, self._steps("command_delay_s"), self._each("motor_lag_s"), self._each("play") / 2
         )
         self._past = DelayLine(self._steps("measurement_delay_s"), 2 * joints)
+        self._bias, self._dropped = self._each("encoder_bias"), self._each("frame_drop")
         sequence = [np.random.SeedSequence([0x5E2507, check_seed("seed", seed), s]) for s in self.serials]
         self._rngs = [np.random.default_rng(s) for s in sequence]
         self._noise: tuple[Array, Array] = (np.zeros((0, n, 2 * joints)), np.zeros((0, n)))
@@ -132,7 +133,7 @@ class SurrogateFleet:
         self._past.fill(rows, at_rest)
         self._delayed[rows] = at_rest
         # The first reading after a reset always arrives: nobody starts a robot that says nothing.
-        self._reading[rows] = at_rest + np.concatenate([self._each("encoder_bias")[rows], np.zeros_like(start)], axis=1)
+        self._reading[rows] = at_rest + np.concatenate([self._bias[rows], np.zeros_like(start)], axis=1)
 
     def advance(self, target: ArrayLike, steps: int, ramp_steps: int = 0) -> None:
         """Command joint angles and let ``steps`` physics steps pass.
@@ -168,10 +169,10 @@ class SurrogateFleet:
         noise, uniform = self._noise[0][0], self._noise[1][0]
         self._noise = (self._noise[0][1:], self._noise[1][1:])
         joints = len(self.body.joint_names)
-        fresh = uniform >= self._each("frame_drop")
+        fresh = uniform >= self._dropped
         reading = self._delayed + noise
         # Encoders sit on the motors: what the gears' play hides from the link shows here.
-        reading[:, :joints] += self._drive.motor - self._drive.link + self._each("encoder_bias")
+        reading[:, :joints] += self._drive.motor - self._drive.link + self._bias
         self._reading[fresh] = reading[fresh]
         return Readings(self._reading[:, :joints].copy(), self._reading[:, joints:].copy(), fresh)
 

@@ -8,9 +8,9 @@ from dataclasses import replace
 
 import pytest
 
+from robotbrain.display import show, table
 from robotbrain.errors import InputError
-from robotbrain.jetson.display import show, table
-from robotbrain.jetson.plot_style import new_figure
+from robotbrain.figures import new_figure
 from robotbrain.jetson.race import Race
 from robotbrain.jetson.twin import Prediction, predict
 from robotbrain.jetson.twin.data import load_kernel_lists

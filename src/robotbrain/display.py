@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import sys
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -33,18 +34,29 @@ class Html:
         return self.markup
 
 
-def show(figure: Figure) -> Html:
-    """Return a figure of :mod:`robotbrain.jetson.plots` (or any whose label says what it shows) with its alt text.
+def show(figure: Figure, alt: str | None = None) -> Html:
+    """Return a figure with its alt text, to stand in the last line of a cell.
+
+    Matplotlib's own way of showing figures in notebooks has no place for alt text; an ``<img>`` has one wherever the
+    notebook goes: JupyterLab, a page of feedback, the book.
+
+    Args:
+        figure: of Matplotlib. One of pyplot's is closed, or it would appear a second time.
+        alt: what is to be seen in it, in words; figures that the kit draws say so themselves.
 
     Raises:
-        InputError: for a figure without a label.
+        InputError: for a figure without alt text.
     """
-    from robotbrain.jetson.plots import alt_text, to_html
+    from robotbrain.figures import alt_text, to_html
 
+    if alt is not None:
+        figure.set_label(alt)
     if not alt_text(figure).strip():
         raise InputError(
-            "figure", given="no label", expected="its alt text", fix="Say what it shows: figure.set_label('...')."
+            "figure", given="no alt text", expected="what it shows, in words", fix='Write show(figure, "...").'
         )
+    if pyplot := sys.modules.get("matplotlib.pyplot"):
+        pyplot.close(figure)
     return Html(to_html(figure), alt_text(figure))
 
 

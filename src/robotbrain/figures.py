@@ -1,4 +1,13 @@
-"""What the figures of the twin have in common: how they look, what they say in words, how they are stored."""
+"""What all figures have in common: colours, how they look, what they say in words, how they are stored.
+
+A figure's label (``figure.set_label``) is its alt text: what is to be seen in it, in words.
+:func:`robotbrain.display.show` puts both into a notebook, and so into the book and the feedback made from it.
+
+The palette follows WCAG 2.2: each colour has a contrast of 3:1 or more with white, as lines and marks need, and INK,
+QUIET and GREY have the 4.5:1 that text needs. Any two of its colours differ by a CIEDE2000 of 15 or more, also for
+people without one kind of cones (as simulated by Machado, Oliveira and Fernandes, 2009). Colour is never the only
+difference all the same: take a line style, a marker or a hatch besides, from LINES, MARKERS and HATCHES.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +16,7 @@ import html
 import io
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from robotbrain.errors import InputError
 from robotbrain.files import atomic_path
@@ -19,12 +28,42 @@ if TYPE_CHECKING:
 FORMATS = ("png", "svg", "pdf")
 """What figures can be written as."""
 
-INK = "#1b1b1b"
-QUIET = "#6b6b6b"
+INK, QUIET = "#1b1b1b", "#6b6b6b"
+"""Of text: titles and labels; remarks."""
+
+BLUE, VERMILLION, GREEN = "#123485", "#E66000", "#127257"
+SKY, MAUVE, BROWN = "#1C9AE6", "#91628C", "#733F01"
+GREY = "#767676"
+"""Of what is there for comparison."""
+
+PALETTE = (BLUE, SKY, GREEN, MAUVE, BROWN, VERMILLION)
+"""In the order to take them; vermillion comes last, since it also marks trouble."""
+
+LINES: tuple[Any, ...] = ("-", "--", ":", "-.", (0, (6, 1, 1, 1, 1, 1)), (0, (1, 3)))
+MARKERS = ("o", "s", "^", "D", "v", "X")
+HATCHES = ("", "////", "....", "\\\\\\\\", "xxxx", "++")
+"""One for each colour of PALETTE, so that nothing depends on seeing colours."""
+
+
+def contrast(one: str, other: str = "#FFFFFF") -> float:
+    """Return the contrast of two colours as WCAG 2.2 defines it, from 1 (none) to 21 (black on white)."""
+    from matplotlib.colors import to_rgb
+
+    def luminance(colour: str) -> float:
+        linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in to_rgb(colour)]
+        return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+    low, high = sorted((luminance(one), luminance(other)))
+    return (high + 0.05) / (low + 0.05)
+
+
+def text_on(colour: str) -> str:
+    """Return what text on an area of this colour is best written in: white or INK."""
+    return "white" if contrast(colour) > contrast(colour, INK) else INK
 
 
 def alt_text(figure: Figure) -> str:
-    """Return what a figure of this module shows, in words."""
+    """Return what a figure shows, in words."""
     return str(figure.get_label())
 
 
@@ -73,10 +112,17 @@ def to_html(figure: Figure, dpi: int = 110) -> str:
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """Return an empty figure of this size in inches that lays itself out."""
+    """Return an empty figure of this size in inches that lays itself out; lines take the colours of PALETTE in turn."""
+    from cycler import cycler
+    from matplotlib import rc_context
     from matplotlib.figure import Figure
 
-    return Figure(figsize=(width, height), layout="constrained", facecolor="white")
+    class PaletteFigure(Figure):
+        def add_subplot(self, *args: Any, **kwargs: Any) -> Any:
+            with rc_context({"axes.prop_cycle": cycler(color=PALETTE)}):  # axes read it when they are made
+                return super().add_subplot(*args, **kwargs)
+
+    return PaletteFigure(figsize=(width, height), layout="constrained", facecolor="white")
 
 
 def tidy(axes: Axes) -> None:
