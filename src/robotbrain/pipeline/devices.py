@@ -192,17 +192,17 @@ def compare_devices(
 
 def plot_devices(summaries: Sequence[DeviceSummary]) -> tuple[Figure, str]:
     """Return a figure of end-to-end latency and success by device, and its alternative text."""
-    from matplotlib.figure import Figure
+    from robotbrain.figures import BLUE, GREEN, SKY, new_figure
 
     names = [f"{s.name.removeprefix('Jetson ')}, {s.power_mode}" + (f"\n{s.label}" * bool(s.label)) for s in summaries]
     rows = np.arange(len(summaries))[::-1]
-    figure = Figure(figsize=(11, 0.62 * len(summaries) + 1.2), layout="constrained")
+    figure = new_figure(11, 0.62 * len(summaries) + 1.2)
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=(3, 2))
-    left.barh(rows, [s.e2e_p99_ms for s in summaries], color="#0072B2", label="99th percentile")
-    left.barh(rows, [s.e2e_p50_ms for s in summaries], height=0.35, color="#E69F00", label="median")
+    left.barh(rows, [s.e2e_p99_ms for s in summaries], color=BLUE, label="99th percentile")
+    left.barh(rows, [s.e2e_p50_ms for s in summaries], height=0.35, color=SKY, label="median")
     left.set(yticks=rows, yticklabels=names, xlabel="sensor to command (ms, simulated)")
     left.legend(loc="center right")
-    right.barh(rows, [100 * s.success_rate for s in summaries], color="#009E73")
+    right.barh(rows, [100 * s.success_rate for s in summaries], color=GREEN)
     right.set(xlim=(0, 119), xticks=range(0, 101, 25), xlabel="worlds solved (%)")
     for row, s in zip(rows, summaries, strict=True):
         right.text(100 * s.success_rate + 2, row, f"{s.successes} of {s.runs}", va="center")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import heapq
 import itertools
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -205,44 +206,40 @@ def astar(cost: ArrayLike, start: Cell, goal: Cell) -> list[Cell] | None:
 
 def path_cost(cost: ArrayLike, path: list[Cell]) -> float:
     """Return the sum of edge costs along ``path`` as :func:`astar_search` counts them."""
-    grid = np.asarray(cost, dtype=float)
     cells = np.asarray(path, dtype=int)
     if len(cells) < 2:
         return 0.0
-    steps = np.linalg.norm(np.diff(cells, axis=0), axis=1)
-    values = grid[cells[:, 0], cells[:, 1]]
-    return float((steps * (values[1:] + values[:-1]) / 2).sum())
+    values = np.asarray(cost, dtype=float)[cells[:, 0], cells[:, 1]]
+    rows, columns = (cells[1:] - cells[:-1]).T
+    return float((np.hypot(rows, columns) * (values[1:] + values[:-1])).sum()) / 2
 
 
-def cells_on_segment(start: ArrayLike, end: ArrayLike) -> NDArray[np.intp]:
-    """Return the (N, 2) cells that the segment between two cell centres passes through, corners included.
+def cells_on_segment(start: Cell, end: Cell) -> NDArray[np.intp]:
+    """Return the (N, 2) cells that the segment between two cell centres touches, in order of row and column.
 
-    Exact: the segment's crossings with the grid lines are computed, not sampled. Where it passes through a corner,
-    both cells beside the corner are included, as in A*'s rule for diagonal steps.
+    Exact, in integers. Where the segment passes through a corner, both cells beside the corner are included, as in A*'s
+    rule for diagonal steps.
     """
-    a, b = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
-    delta = b - a
-    crossings = [np.array([0.0, 1.0])]
-    for axis in range(2):
-        if delta[axis]:
-            low, high = sorted((a[axis], b[axis]))
-            lines = np.arange(np.floor(low) + 0.5, high, 1.0)
-            crossings.append((lines - a[axis]) / delta[axis])
-    t = np.unique(np.concatenate(crossings).clip(0.0, 1.0))
-    middles = a + (t[:-1, None] + t[1:, None]) / 2 * delta
-    # Points a hair to either side of each crossing catch the cells that touch the segment at a corner only.
-    normal = np.array([-delta[1], delta[0]]) * (1e-7 / max(float(np.abs(delta).max()), 1e-12))
-    on_line = a + t[:, None] * delta
-    points = np.concatenate([middles, on_line + normal, on_line - normal, a[None], b[None]])
-    return np.unique(np.rint(points).astype(np.intp), axis=0)
+    (row, column), (last, stop) = sorted(((int(start[0]), int(start[1])), (int(end[0]), int(end[1]))))
+    height, width = last - row, stop - column
+    if not height:
+        found = [(row, c) for c in range(column, stop + 1)]
+        return np.array(found, dtype=np.intp)
+    found = []
+    for k in range(height + 1):
+        # Half rows above the start, where the segment enters and leaves this row of cells; there it is at column
+        # + half * width / (2 * height), and touches cells up to half a cell away.
+        near, far = sorted((max(2 * k - 1, 0) * width, min(2 * k + 1, 2 * height) * width))
+        first, final = column - (height - near) // (2 * height), column + (height + far) // (2 * height)
+        found += [(row + k, c) for c in range(first, final + 1)]
+    return np.array(found, dtype=np.intp)
 
 
-def segment_cost(cost: NDArray[np.float64], start: ArrayLike, end: ArrayLike) -> float:
+def segment_cost(cost: NDArray[np.float64], start: Cell, end: Cell) -> float:
     """Return length times mean cost of the cells on a straight segment; inf if any of them is lethal."""
     cells = cells_on_segment(start, end)
-    values = cost[cells[:, 0], cells[:, 1]]
-    length = float(np.linalg.norm(np.asarray(end, dtype=float) - np.asarray(start, dtype=float)))
-    return length * float(values.mean()) if np.isfinite(values).all() else LETHAL
+    mean = float(cost[cells[:, 0], cells[:, 1]].mean())
+    return math.dist(start, end) * mean if math.isfinite(mean) else LETHAL
 
 
 def smooth(path: list[Cell], cost: ArrayLike, slack: float = 1.05) -> list[Cell]:
