@@ -3,8 +3,10 @@
 Run with ``python benchmarks/grading_stock.py`` (``--labs lab_integration --each 3 --rounds 1`` for a quick look). Of
 each lab it takes the reference, one half done, some styles and mutants. Stock nbgrader gets its own ``Execute`` and its
 own preprocessors; told apart from the defaults are only the tag of the cells that are not run while grading (the kit
-does not run them either), the time limit per cell that the labs need, and where the hidden tests are. The kit runs with
-the sandbox and the tester. The two take turns, each in a process of its own, on one core and on two (``taskset``).
+does not run them either), the time limit per cell that the labs need, where the hidden tests are, and the student's
+name in the environment (on which random draws of tests depend). The kit runs with the sandbox and the tester. The two
+take turns, each in a process of its own, on one core and on two (``taskset``); the kit runs as many submissions at the
+same time as it does by default on that many cores, stock nbgrader one after the other, which is all it can.
 
 Steady state is the time from the first finished submission to the last, per submission; for the kit, which executes
 first and then enters the marks, it is the sum of both parts. The whole process includes all imports. ``--feedback``
@@ -29,6 +31,8 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 LABS = ("lab_integration", "hw1_rl", "hw2_optimisation", "hw3_performance")
 STOCK_CONFIG = """
 import os, time
+from nbgrader.converters import Autograde
+
 c = get_config()
 c.CourseDirectory.root = {root!r}
 c.CourseDirectory.source_directory = "source"
@@ -40,6 +44,11 @@ def note(**names):
     with open(os.path.join({root!r}, "times"), "a") as file:
         file.write(f"{{time.perf_counter()}}\\n")
 
+def init_assignment(self, assignment_id, student_id, start=Autograde.init_assignment):
+    os.environ["NBGRADER_STUDENT"] = student_id  # stock nbgrader tells nobody; the kit's random draws depend on it
+    return start(self, assignment_id, student_id)
+
+Autograde.init_assignment = init_assignment
 c.Autograde.post_convert_hook = note
 """
 
@@ -90,20 +99,21 @@ def run_stock(base: Path, lab: str, cores: str) -> dict[str, Any]:
     return {"whole": whole, "steady": (times[-1] - times[0]) / (len(times) - 1), "scores": scores(root, lab)}
 
 
-def run_kit(base: Path, lab: str, cores: str, jobs: int, feedback: bool) -> dict[str, Any]:
+def run_kit(base: Path, lab: str, cores: str, feedback: bool) -> dict[str, Any]:
     """Grade with the kit; :func:`kit_main` runs in the process."""
     root = base / "kit" / lab
-    command = [sys.executable, __file__, "--inner", str(base), lab, str(jobs), str(int(feedback))]
+    command = [sys.executable, __file__, "--inner", str(base), lab, str(int(feedback))]
     whole = run(command, cores, base, base / "kit.log")
     return {"whole": whole, **json.loads((base / "times.json").read_text()), "scores": scores(root, lab)}
 
 
-def kit_main(base: Path, lab: str, jobs: int, feedback: bool) -> None:
+def kit_main(base: Path, lab: str, feedback: bool) -> None:
     """What a run of the kit is, with a note of the times."""
-    from robotbrain.grading import classroom
+    from robotbrain.grading import classroom, scheduler
     from robotbrain.grading.course import find_course
     from robotbrain.grading.entry import Entry
 
+    jobs = scheduler.fitting_workers()  # as without --jobs, on the cores that this process may use
     executed: list[float] = []
     entered: list[float] = []
     enter = Entry.enter
@@ -127,8 +137,9 @@ def kit_main(base: Path, lab: str, jobs: int, feedback: bool) -> None:
     )
     end = time.perf_counter()
     pages = (end - entered[-1]) / len(entered) if feedback else 0.0
+    first = min(jobs, len(executed) - 1)  # these ended with the imports still under way
     parts = [
-        (executed[-1] - executed[jobs - 1]) / (len(executed) - jobs),
+        (executed[-1] - executed[first - 1]) / (len(executed) - first),
         (entered[-1] - entered[0]) / (len(entered) - 1),
     ]
     (base / "times.json").write_text(json.dumps({"steady": sum(parts) + pages, "parts": [*parts, pages]}))
@@ -160,8 +171,8 @@ def differences(lab: str, stock: dict[str, float], kit: dict[str, float]) -> lis
 def main() -> int:
     """Run the benchmark; 1 if a score differs."""
     if sys.argv[1:2] == ["--inner"]:
-        base, lab, jobs, feedback = sys.argv[2:]
-        kit_main(Path(base), lab, int(jobs), bool(int(feedback)))
+        base, lab, feedback = sys.argv[2:]
+        kit_main(Path(base), lab, bool(int(feedback)))
         return 0
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--labs", nargs="+", default=list(LABS), choices=LABS)
@@ -181,7 +192,7 @@ def main() -> int:
                 sums = {"steady": [0.0, 0.0], "whole": [0.0, 0.0]}
                 for lab in arguments.labs:
                     stock = run_stock(base, lab, pinned)
-                    kit = run_kit(base, lab, pinned, cores, arguments.feedback)
+                    kit = run_kit(base, lab, pinned, arguments.feedback)
                     wrong |= set(differences(lab, stock["scores"], kit["scores"]))
                     for kind, (a, b) in sums.items():
                         sums[kind] = [a + stock[kind], b + kit[kind]]

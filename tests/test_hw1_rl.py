@@ -143,14 +143,14 @@ def test_our_bounds_are_those_of_scipy() -> None:
         wilson = binomtest(k, n).proportion_ci(0.95, method="wilson")
         assert evidence.wilson(k, n) == pytest.approx((wilson.low, wilson.high), abs=1e-4)
     # What the notebook says of the threshold, and that a policy that reaches 92 % hardly ever fails by bad luck.
-    assert evidence.exact_bound(266, 300) >= policy.SIMULATION_BOUND > evidence.exact_bound(265, 300)
+    assert evidence.exact_bound(266, 300) >= policy.SIMULATION.threshold > evidence.exact_bound(265, 300)
     from scipy.stats import binom
 
     assert binom.cdf(265, 300, 0.93) < 1e-2 and binom.cdf(265, 300, 0.95) < 1e-5
 
 
-@pytest.mark.parametrize(("threshold", "looks"), [(policy.SIMULATION_BOUND, policy.FINAL_IN_SIMULATION),
-                                                  (policy.SURROGATE_BOUND, policy.FINAL_ON_SURROGATES)])  # fmt: skip
+@pytest.mark.parametrize(("threshold", "looks"), [(t.threshold, t.final)
+                                                  for t in (policy.SIMULATION, policy.SURROGATES)])  # fmt: skip
 def test_looking_early_settles_what_is_clear_and_lets_hardly_anything_through(threshold: float, looks: Any) -> None:
     rng = np.random.default_rng(2)
 
@@ -304,7 +304,7 @@ def test_the_gap_is_there_and_randomisation_closes_it(handed_in: Path) -> None:
     }
     _, low, _ = evidence.newcombe(outcomes["reach_policy_robust"], outcomes["reach_policy"])
     assert low > 0.2
-    assert evidence.exact_bound(sum(outcomes["reach_policy_robust"]), 60) > policy.SURROGATE_BOUND
+    assert evidence.exact_bound(sum(outcomes["reach_policy_robust"]), 60) > policy.SURROGATES.threshold
 
 
 # ---------------------------------------------------------------- answers, near and far

@@ -46,6 +46,23 @@ def known_drives():
         yield tuple(key), drives.Drive(**run)
 
 
+PLANTED = (("cpu", False), ("cpu", True), ("gpu", False), ("gpu", True), ("sharing", False), ("none", False))
+"""Cause of a planted bottleneck, and whether all stages share a thread."""
+PIPELINES = 5
+"""Planted pipelines of each kind: made before the first submission comes; a student's seed says which are asked."""
+
+
+@functools.cache
+def _pipeline(cause, one_thread, which):
+    rng = np.random.default_rng([0x71BE, traces.PLANTS.index(cause), one_thread, which])
+    return traces.random_pipeline(rng, cause, one_thread=one_thread)
+
+
+def _planted(rng, cause, one_thread=False):
+    """Return one of the planted traces and its bottleneck (role, cause)."""
+    return _pipeline(cause, one_thread, int(rng.integers(PIPELINES)))
+
+
 def _random_trace(rng, images=12, limit=math.inf):
     """Images at about 10 Hz, some of which wait long or for ever; commands at 20 Hz from before the first image."""
     taken = np.cumsum(rng.uniform(80, 120, images)).round(1)
@@ -114,7 +131,7 @@ def rhythm_random(student):
 def utilisation_random(student):
     rng = student.rng("utilisation")
     for cause in ("gpu", "sharing"):
-        trace, _ = traces.random_pipeline(rng, cause)
+        trace, _ = _planted(rng, cause)
         tools.compare_utilisation(student, trace, "four stages, 4 cores and a GPU")
     script = traces.Script()
     for k in range(4):
@@ -171,21 +188,17 @@ def chain_brain(student):
 @suite.test("bottleneck", points=4, name="planted bottlenecks", reread="Exercise 2.3", time_limit_s=30)
 def bottleneck_planted(student):
     rng = student.rng("bottleneck")
-    cases = [(cause, alone) for cause in ("cpu", "gpu") for alone in (False, True)] + [
-        ("sharing", True),
-        ("none", False),
-    ]
     right = 0
     failure = None
-    for cause, alone in cases:
-        trace, answer = traces.random_pipeline(rng, cause, one_thread=alone)
+    for cause, alone in PLANTED:
+        trace, answer = _planted(rng, cause, alone)
         try:
             tools.compare_bottleneck(student, trace, answer, "a planted pipeline")
             right += 1
         except AssertionError as error:
             failure = failure or error
     if failure is not None:
-        failure.credit = 0.5 if right >= len(cases) - 1 else 0.0
+        failure.credit = 0.5 if right >= len(PLANTED) - 1 else 0.0
         raise failure
 
 
@@ -366,6 +379,9 @@ for _key, _drive in known_drives():
 
 @suite.warm
 def make_recordings():
-    """Let the brain drive whose traces tests read."""
+    """Let the brain drive whose traces tests read, and the planted pipelines run."""
     for stage, module, seconds, _ in RECORDED:
         traces.brain_run(stage, module, seconds)
+    for cause, alone in PLANTED:
+        for which in range(PIPELINES):
+            _pipeline(cause, alone, which)

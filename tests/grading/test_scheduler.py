@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import nbformat
 import pytest
@@ -277,3 +278,13 @@ def test_no_notebook_and_no_marks_of_a_submission_stay_in_memory(tmp_path: Path)
     assert counts[1] - counts[0] < 60  # the course's own notebook is kept; 30 submissions have 30 times as much
     assert [len(result.rows) for result in kept] == [2, 32]
     assert sum(row.earned for row in kept[1].rows) > 0
+
+
+@pytest.mark.parametrize(("cores", "free", "fitting"), [(1, 64, 2), (4, 64, 8), (4, 3, 3), (2, 0, 1)])
+def test_two_submissions_run_on_each_core_if_memory_allows(
+    cores: int, free: int, fitting: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)), raising=False)
+    memory = SimpleNamespace(available=free << 30)
+    monkeypatch.setattr(scheduler.psutil, "virtual_memory", lambda: memory)
+    assert scheduler.fitting_workers() == fitting

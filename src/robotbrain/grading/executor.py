@@ -1,7 +1,8 @@
 """Runs one submission: its cells in the student's process, its graded cells in the tester.
 
-First the *pass*: every ordinary cell runs in order. At each graded cell the student's process forks a snapshot, which
-keeps the notebook as it is at that place. A cell that ends or hangs the process is left out, and the pass begins anew
+First the *pass*: every ordinary cell runs in order. At graded cells the student's process forks snapshots, which keep
+the notebook as it is at that place (one for several where nothing can have changed, see
+:mod:`robotbrain.grading.copies`). A cell that ends or hangs the process is left out, and the pass begins anew
 in a fresh process. Then the *scoring*: nothing that the student's process says is listened to any more; the tester
 asks the snapshots, first all visible tests, then all hidden ones, so that what a hidden test passes in cannot come
 back in the report of a visible one. A test that ends its snapshot costs that test; the next ones get a fresh copy.
@@ -17,6 +18,7 @@ from typing import Any, Protocol
 from nbformat.notebooknode import NotebookNode
 
 from robotbrain.grading import outputs
+from robotbrain.grading.copies import shared_copies
 from robotbrain.grading.execute import SKIP_TAGS, Execution, Limits, is_graded, label, make_gradable, note_not_run
 from robotbrain.grading.sandbox.process import CellEnd, CellLimits, StudentProcess
 from robotbrain.grading.sandbox.snapshots import Snapshot
@@ -86,6 +88,9 @@ class Executor:
             if _for_tester(cell)
         ]
         self._by_index = {g.index: g for g in self._graded}
+        run = [i for i, c in enumerate(notebook.cells) if c.cell_type == "code" and not _skipped(c)]
+        ordinary = [i for i in run if i not in self._by_index]
+        self._served = shared_copies(notebook.cells, [i for i in run if i in self._by_index], ordinary, files)
 
     def run(self) -> Execution:
         """Run everything; never raises for what the submission does.
@@ -155,7 +160,7 @@ class Executor:
             cell.outputs, cell.execution_count = [], None
             if not cell.source.strip():
                 continue
-            if SKIP_TAGS & set(cell.metadata.get("tags", [])):
+            if _skipped(cell):
                 cell.outputs = [outputs.stream("This cell is not run while grading.\n")]
                 continue
             if index in self._state.poisoned:
@@ -164,12 +169,19 @@ class Executor:
             number += 1
             cell.execution_count = number
             if graded is not None:
-                graded.snapshot = process.snapshot()
+                if self._served[index] == index:
+                    self._share(index, process.snapshot())
                 continue
             end = self._run_cell(process, index, number)
             if end in (CellEnd.DIED, CellEnd.HUNG) or time.monotonic() >= self._deadline:
                 return index, end
         return None
+
+    def _share(self, index: int, snapshot: Snapshot | None) -> None:
+        """Let all graded cells that can be tested in the copy made at cell ``index`` be tested there."""
+        for graded in self._graded:
+            if self._served.get(graded.index) == index:
+                graded.snapshot = snapshot
 
     def _run_cell(self, process: StudentProcess, index: int, number: int) -> CellEnd:
         cell = self._notebook.cells[index]
@@ -243,6 +255,10 @@ class Executor:
         if self._process is not None:
             self._process.close()
             self._process = None
+
+
+def _skipped(cell: NotebookNode) -> bool:
+    return bool(SKIP_TAGS & set(cell.metadata.get("tags", [])))
 
 
 def _for_tester(cell: NotebookNode) -> bool:

@@ -62,6 +62,7 @@ class Submission:
         self._aliases = _aliases(node for _, _, nodes in parsed for node in nodes)
         self._student = [(number, node) for number, cell, nodes in parsed if not cell.get("locked") for node in nodes]
         self._pieces: dict[str, list[_Piece]] = defaultdict(list)
+        self._readings: dict[ast.AST, _Reading] = {}
         for _, node in self._student:
             for name, piece in _pieces(node):
                 self._pieces[name].append(piece)
@@ -72,15 +73,15 @@ class Submission:
         own = suite.exercises[exercise].provides
         others = {name for entry in suite.exercises.values() for name in entry.provides} - set(own)
         references = {name: suite.load_reference(name) for name in own if name in suite.references}
-        judge = _Judge(ban, list(references.values()), self._aliases)
+        judge = _Judge(ban, list(references.values()))
         doubts = self._doubts if exercise in suite.bans else []
         tricks: list[str] = []
         for piece in self._reached(own, others, any(callable(r) for r in references.values())):
-            used = next(filter(judge.certain, judge.uses(piece)), None)
+            used = next(filter(judge.certain, self._read(piece).uses), None)
             if used:
                 reason = f"`{own[0]}` uses `{used}`, which is or holds the course's own solution; write your own"
                 return reason, doubts
-            tricks += _tricks(piece, self._aliases)
+            tricks += self._read(piece).tricks
         if exercise in suite.bans and not any(name in self._pieces for name in own):
             tricks += [doubt.rpartition(": ")[2].strip("`") for doubt in doubts]  # made by one of these, if at all
         if exercise in suite.bans and tricks:
@@ -90,9 +91,15 @@ class Submission:
 
     @functools.cached_property
     def _doubts(self) -> list[str]:
-        tricks = ((number, what) for number, node in self._student for what in _tricks(node, self._aliases))
+        tricks = ((number, what) for number, node in self._student for what in self._read(node).tricks)
         sentences = (f"cell {number}: looks like a way around what is forbidden: `{what}`" for number, what in tricks)
         return list(dict.fromkeys(sentences))[:_MOST_DOUBTS]
+
+    def _read(self, node: ast.AST) -> _Reading:
+        """What can be read off a piece of code: once, though most exercises ask about the same pieces."""
+        if node not in self._readings:
+            self._readings[node] = _Reading(node, self._aliases)
+        return self._readings[node]
 
     def _reached(self, own: Sequence[str], others: set[str], is_callable: bool) -> Iterator[ast.AST]:
         """What the answer is made of: its definitions, and those of what they use."""
@@ -102,32 +109,46 @@ class Submission:
             if piece.only_if_callable and not (is_callable and name in own):
                 continue
             yield piece.node
-            loaded = _globals_of(piece.node) - names - others
+            loaded = self._read(piece.node).loads - names - others
             names |= loaded
             todo += [(used, more) for used in loaded for more in self._pieces.get(used, ())]
 
 
-class _Judge:
-    """What is banned, and what a piece of code uses."""
+class _Reading:
+    """What can be read off a piece of code."""
 
-    def __init__(self, ban: Ban, references: Sequence[Any], aliases: Mapping[str, str]) -> None:
-        self._ban, self._references, self._aliases = ban, references, aliases
+    def __init__(self, node: ast.AST, aliases: Mapping[str, str]) -> None:
+        self._node, self._aliases = node, aliases
 
-    def uses(self, node: ast.AST, aliases: Mapping[str, str] | None = None) -> Iterator[str]:
-        """Dotted names from banned modules that ``node`` uses, by whatever way can be read off the text."""
-        aliases = self._aliases if aliases is None else aliases
+    @functools.cached_property
+    def uses(self) -> tuple[str, ...]:
+        """Dotted names that it uses, by whatever way can be read off the text."""
+        return tuple(dict.fromkeys(filter(None, self._uses(self._node, self._aliases))))
+
+    @functools.cached_property
+    def tricks(self) -> tuple[str, ...]:
+        """Parts of it whose meaning cannot be read off the text."""
+        return tuple(_tricks(self._node, self._aliases))
+
+    @functools.cached_property
+    def loads(self) -> set[str]:
+        """Names in it that are not its own."""
+        return _globals_of(self._node)
+
+    def _uses(self, node: ast.AST, aliases: Mapping[str, str]) -> Iterator[str]:
+        """Dotted names that ``node`` and what is in it use; some may be empty."""
         if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)):
             local = _locals(node)
             aliases = {name: dotted for name, dotted in aliases.items() if name not in local} | _aliases([node])
-        yield from filter(self._banned, self._used(node, aliases))
+        yield from self._used(node, aliases)
         for child in ast.iter_child_nodes(node):
             in_chain = isinstance(node, ast.Attribute) and isinstance(child, (ast.Attribute, ast.Name))
             docstring = isinstance(node, ast.Expr) and isinstance(child, ast.Constant)
             if not in_chain and not docstring:
-                yield from self.uses(child, aliases)
+                yield from self._uses(child, aliases)
 
     def _used(self, node: ast.AST, aliases: Mapping[str, str]) -> Iterator[str]:
-        """What this node names by itself, banned or not."""
+        """What this node names by itself."""
         if isinstance(node, ast.ImportFrom) and not node.level:
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
         elif isinstance(node, (ast.Attribute, ast.Name)):
@@ -135,7 +156,7 @@ class _Judge:
         elif isinstance(node, ast.Call) and _called(node) in _RUNNING and node.args:
             text = _folded(node.args[0])
             for statement in _parse(text) if isinstance(text, str) else ():
-                yield from self.uses(statement)
+                yield from self._uses(statement, self._aliases)
         elif isinstance(node, ast.Call) and _called(node) == "getattr" and len(node.args) > 1:
             yield f"{_dotted(node.args[0], aliases)}.{_folded(node.args[1])}"
         text = _folded(node)
@@ -144,10 +165,17 @@ class _Judge:
         elif isinstance(text, str):  # code for another interpreter, say
             yield from _DOTTED_INSIDE.findall(text[:_LONGEST_TEXT])
 
+
+class _Judge:
+    """What is banned."""
+
+    def __init__(self, ban: Ban, references: Sequence[Any]) -> None:
+        self._ban, self._references = ban, references
+
     def certain(self, dotted: str) -> bool:
-        """Whether using ``dotted`` is what the ban is meant for."""
+        """Whether ``dotted`` is from a banned module, and using it is what the ban is meant for."""
         names = dotted.split(".")
-        if names[-1] in self._ban.allow:
+        if not module_banned(dotted, self._ban) or names[-1] in self._ban.allow:
             return False
         if names[-1] == "*" or names[0] != "robotbrain":
             return True
@@ -160,9 +188,6 @@ class _Judge:
             return True
         own = isinstance(found, FunctionType) and module_banned(found.__module__, self._ban)
         return own and found.__name__ not in self._ban.allow
-
-    def _banned(self, dotted: str) -> bool:
-        return module_banned(dotted, self._ban)
 
 
 def _tricks(node: ast.AST, aliases: Mapping[str, str]) -> Iterator[str]:

@@ -91,6 +91,7 @@ class Suite:
         self.references: dict[str, str | Callable[[], Any]] = {}
         self.bans: dict[str, Ban] = {}
         self.warmers: list[Callable[[], object]] = []
+        self.student_warmers: list[Callable[[], object]] = []
         self.crossing: list[type] = []
         self.hidden_by_default = False
 
@@ -170,6 +171,15 @@ class Suite:
         from a process that has them. Nothing may depend on its having run.
         """
         self.warmers.append(function)
+        return function
+
+    def warm_students(self, function: Warmer) -> Warmer:
+        """Register ``function()`` (a decorator) to run once in the process that students' processes are copied from.
+
+        Use it, in a visible suite, to do for the first time what costs more the first time: imports inside of
+        functions, a library's first training step. It must hold no answers, and leave random generators alone.
+        """
+        self.student_warmers.append(function)
         return function
 
     def crosses(self, *classes: type) -> None:

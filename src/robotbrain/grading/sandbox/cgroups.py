@@ -167,7 +167,7 @@ def _write(folders: list[Path], file: str, text: str) -> None:
 def _places() -> list[tuple[bool, list[Path]]]:
     """Where groups might be made, the most fitting place first."""
     try:
-        lines = [line.split(":", 2) for line in Path("/proc/self/cgroup").read_text().splitlines()]
+        lines = [line.split(":", 2) for line in Path("/proc/self/cgroup").read_text(encoding="utf-8").splitlines()]
     except OSError:
         return []
     own = {name: path for _, names, path in lines for name in names.split(",")}

@@ -9,13 +9,15 @@ without forking). Its answers: ``ready``, a cell's outputs, ``done``, ``forked``
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import shutil
 import signal
 import socket
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+import traceback
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -36,6 +38,24 @@ def prepare(seccomp: bytes | None = None) -> None:
     torch = sys.modules.get("torch")
     if torch is not None:
         torch.set_num_threads(1)  # a pool used before the fork would hang the child
+    _warm_up()
+
+
+def _warm_up() -> None:
+    """Do for the first time what the labs' tests will ask of every copy."""
+    from robotbrain.grading.remote import rehearse
+    from robotbrain.grading.suite import Suite
+
+    for module in list(sys.modules.values()):
+        suite = vars(module).get("suite")
+        if not isinstance(suite, Suite) or not module.__name__.startswith("robotbrain.grading.suites."):
+            continue
+        warmers: list[Callable[[], object]] = [*suite.student_warmers, functools.partial(rehearse, suite)]
+        for warm in warmers:
+            try:
+                warm()
+            except Exception:  # whoever needs it meets the error itself
+                traceback.print_exc()
 
 
 def main(job: Mapping[str, Any], sockets: Sequence[socket.socket]) -> None:
@@ -53,7 +73,7 @@ def main(job: Mapping[str, Any], sockets: Sequence[socket.socket]) -> None:
     if not monitor.wait_for_go(line):
         return
     with contextlib.suppress(OSError):  # if the host runs out of memory, this is to go first
-        Path("/proc/self/oom_score_adj").write_text("1000")
+        Path("/proc/self/oom_score_adj").write_text("1000", encoding="utf-8")
     contained = isolation.enter_namespaces()
     if not contained:
         from robotbrain.grading.sandbox import linux

@@ -252,7 +252,7 @@ def server_environment(recipe: Recipe) -> dict[str, str]:
     path = os.pathsep.join((str(Path(sys.executable).parent), *(("/usr/local/bin", "/usr/bin", "/bin"))))
     environment = {"PATH": path, "LANG": "C.UTF-8", "TMPDIR": tempfile.gettempdir()}
     if sys.platform == "win32":
-        needed = {"SYSTEMROOT", "SYSTEMDRIVE", "TEMP", "PATH"}
+        needed = {"SYSTEMROOT", "SYSTEMDRIVE", "TEMP", "PATH", "USERPROFILE"}  # the last one: Path.home()
         environment |= {k: v for k, v in os.environ.items() if k.upper() in needed}
     if not _installed():
         environment["PYTHONPATH"] = str(Path(robotbrain.__file__).parents[1])
@@ -267,7 +267,7 @@ def _installed() -> bool:
 
 
 def _pid_here(pidfd: int) -> int:
-    for line in Path(f"/proc/self/fdinfo/{pidfd}").read_text().splitlines():
+    for line in Path(f"/proc/self/fdinfo/{pidfd}").read_text(encoding="utf-8").splitlines():
         if line.startswith("Pid:"):
             return int(line.split()[1])
     raise ChannelError("not a process")

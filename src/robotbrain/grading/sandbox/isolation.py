@@ -124,6 +124,6 @@ def give_up_rights(seccomp: bytes | None) -> None:
 
 def _mapped_bytes() -> int:
     try:
-        return int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        return int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[0]) * resource.getpagesize()
     except OSError:
         return 0

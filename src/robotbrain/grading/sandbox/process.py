@@ -341,7 +341,7 @@ def _children(pid: int) -> list[int]:
 def _own_number(pid: int) -> int | None:
     """The number of process ``pid`` as it sees it itself."""
     with contextlib.suppress(OSError):
-        for line in Path(f"/proc/{pid}/status").read_text().splitlines():
+        for line in Path(f"/proc/{pid}/status").read_text(encoding="utf-8").splitlines():
             if line.startswith("NSpid:"):
                 return int(line.split()[-1])
     return None

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from robotbrain.grading.sandbox.channel import Channel, ChannelClosed
+from robotbrain.grading.sandbox.heap import fill_holes
 from robotbrain.grading.sandbox.linux import adopt_orphans, die_with_parent, set_dumpable
 from robotbrain.grading.sandbox.names import import_all, resolve
 
@@ -50,6 +51,7 @@ def serve(channel: Channel) -> None:
         resolve(setup["prepare"])(**setup["arguments"])
     entry = resolve(setup["entry"])
     gc.collect()
+    fill_holes()
     gc.freeze()
     threads = len(list(Path("/proc/self/task").iterdir()))
     channel.send({"ready": time.perf_counter() - start, "threads": threads, "failed": failed, "pid": os.getpid()})
@@ -111,7 +113,9 @@ def _reap(children: set[int]) -> None:
 
 def _own_children() -> list[int]:
     try:
-        return [int(p) for p in Path("/proc/self/task", str(os.getpid()), "children").read_text().split()]
+        return [
+            int(p) for p in Path("/proc/self/task", str(os.getpid()), "children").read_text(encoding="utf-8").split()
+        ]
     except OSError:  # a kernel without CONFIG_PROC_CHILDREN
         return []
 

@@ -13,6 +13,7 @@ from robotbrain.grading.suites import hw1_rl_evidence as evidence
 from robotbrain.grading.suites import hw1_rl_learning as learning
 from robotbrain.grading.suites import hw1_rl_memory as memory
 from robotbrain.grading.suites import hw1_rl_policy as policy
+from robotbrain.grading.suites.training import first_steps
 
 suite = Suite("hw1_rl")
 
@@ -151,6 +152,8 @@ for _key, _text in (evidence.HINTS | policy.HINTS).items():
 
 
 suite.warm(policy.warm)
+suite.warm_students(policy.warm_students)
+suite.warm_students(first_steps)
 
 
 # ---------------------------------------------------------------- Part 1: reading
@@ -269,15 +272,7 @@ def policy_file(student: Any) -> None:
 
 @suite.test("policy", points=4, name="100 targets to practise", reread="Exercise 4.1", time_limit_s=60)
 def policy_practice(student: Any) -> None:
-    policy.judge(
-        student,
-        student.POLICY,
-        policy.PRACTICE_SERIALS,
-        20,
-        nominal=True,
-        threshold=policy.SIMULATION_BOUND,
-        looks=policy.PRACTICE_IN_SIMULATION,
-    )
+    policy.practise(student, student.POLICY, policy.SIMULATION)
 
 
 # ---------------------------------------------------------------- Part 5: evidence
@@ -306,12 +301,4 @@ def robust_events(student: Any) -> None:
 
 @suite.test("robust", points=2, name="100 arms to practise", reread="Exercise 6.1", time_limit_s=60)
 def robust_practice(student: Any) -> None:
-    policy.judge(
-        student,
-        student.ROBUST_POLICY,
-        policy.PRACTICE_SERIALS,
-        21,
-        nominal=False,
-        threshold=policy.SURROGATE_BOUND,
-        looks=policy.PRACTICE_ON_SURROGATES,
-    )
+    policy.practise(student, student.ROBUST_POLICY, policy.SURROGATES)

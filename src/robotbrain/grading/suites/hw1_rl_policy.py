@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,10 +23,6 @@ if TYPE_CHECKING:
     from robotbrain.rl.onnx_policy import OnnxPolicy
     from robotbrain.rl.surrogate.reach import ReachEpisodes
 
-SIMULATION_BOUND = 0.85
-"""At least this success rate must be proved in simulation ..."""
-SURROGATE_BOUND = 0.80
-"""... and this on surrogates. Proved: the lower end of the exact one-sided 95 % interval."""
 HALF = 0.60
 """What is proved at least for half of the points."""
 PRACTICE_SERIALS = range(100)
@@ -108,34 +105,54 @@ def episodes(policy: OnnxPolicy, serials: Sequence[int], seed: int, *, nominal: 
         raise  # for the type checker: fail always raises
 
 
-PRACTICE_IN_SIMULATION = ((15, 0.10), (40, 0.05), (100, 0.05))
-PRACTICE_ON_SURROGATES = ((11, 0.10), (40, 0.05), (100, 0.05))
-FINAL_IN_SIMULATION = ((20, 0.04), (60, 0.01), (300, 0.05))
-FINAL_ON_SURROGATES = ((15, 0.04), (60, 0.01), (300, 0.05))
+Looks = tuple[tuple[int, float], ...]
 """After how many targets to look, and with how much doubt the wanted rate may then be thought to be proved. A policy
 that reaches nearly all of them needs few: all of the first look's settle it."""
 
 
-def judge(
-    student: Any,
-    name: Any,
-    serials: Sequence[int],
-    seed: int,
-    *,
-    nominal: bool,
-    threshold: float,
-    looks: Sequence[tuple[int, float]],
-) -> None:
-    """Fail unless the successes prove a rate of at least ``threshold``; half of the points for ``HALF``.
+@dataclass(frozen=True)
+class Trial:
+    """Where a policy is tried, and what it must prove there.
+
+    Attributes:
+        nominal: in simulation, as in :func:`episodes`.
+        threshold: at least this success rate; proved is the lower end of the exact one-sided 95 % interval.
+        practice_seed: of what students may try.
+        practice, final: the looks.
+    """
+
+    nominal: bool
+    threshold: float
+    practice_seed: int
+    practice: Looks
+    final: Looks
+
+
+SIMULATION = Trial(True, 0.85, 20, ((15, 0.10), (40, 0.05), (100, 0.05)), ((20, 0.04), (60, 0.01), (300, 0.05)))
+SURROGATES = Trial(False, 0.80, 21, ((11, 0.10), (40, 0.05), (100, 0.05)), ((15, 0.04), (60, 0.01), (300, 0.05)))
+
+
+def practise(student: Any, name: Any, trial: Trial) -> None:
+    """Judge a policy by the targets and arms that students may try."""
+    judge(student, name, trial, PRACTICE_SERIALS, trial.practice_seed, trial.practice)
+
+
+def decide(student: Any, name: Any, trial: Trial, rng: np.random.Generator) -> None:
+    """Judge a policy by targets and arms that nobody has seen."""
+    first, seed = (int(number) for number in rng.integers(10**6, 10**9, 2))
+    judge(student, name, trial, range(first, first + trial.final[-1][0]), seed, trial.final)
+
+
+def judge(student: Any, name: Any, trial: Trial, serials: Sequence[int], seed: int, looks: Looks) -> None:
+    """Fail unless the successes prove a rate of the trial's threshold; half of the points for ``HALF``.
 
     Args:
         student: whose files they are.
         name: of the file.
-        serials, seed, nominal: as in :func:`episodes`.
-        threshold: for the lower end of the exact one-sided interval.
-        looks: after how many serials to look, and how much doubt the interval then leaves. A policy that cannot come
-            to half of the points any more is not looked at any further.
+        serials, seed: as in :func:`episodes`.
+        looks: a policy that cannot come to half of the points any more is not looked at any further.
     """
+    nominal, threshold = trial.nominal, trial.threshold
     policy = load(student, name)
     errors, reached, n = [], 0, 0
     for number, (count, doubt) in enumerate(looks):
@@ -293,6 +310,12 @@ def _entity(value: Any) -> Any:
     everything = str(slice(None))
     chosen = {key: v for key, v in value.items() if not (key in ("joint_ids", "body_ids") and v == everything)}
     return SceneEntityCfg(**chosen)
+
+
+def warm_students() -> None:
+    """Describe the task for the first time, as it comes back from students' processes."""
+    probes.events_of(_plain_task())
+    _plain_task().to_dict()
 
 
 def warm() -> None:

@@ -14,6 +14,7 @@ from robotbrain.grading.suites import hw2_optimisation_judge as judge
 from robotbrain.grading.suites import hw2_optimisation_learning as learning
 from robotbrain.grading.suites import hw2_optimisation_network as network_file
 from robotbrain.grading.suites import hw2_optimisation_numbers as numbers
+from robotbrain.grading.suites.training import first_steps
 
 suite = Suite("hw2_optimisation")
 
@@ -66,6 +67,8 @@ for _key, _text in (numbers.HINTS | learning.HINTS | network_file.HINTS | judge.
 
 
 suite.warm(judge.warm)
+suite.warm_students(judge.warm_students)
+suite.warm_students(first_steps)
 
 
 # ---------------------------------------------------------------- Part 1: reading

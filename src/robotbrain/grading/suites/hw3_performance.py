@@ -13,7 +13,7 @@ from robotbrain.grading.suites import hw3_performance_drives as drives
 from robotbrain.grading.suites import hw3_performance_tools as tools
 from robotbrain.grading.suites import hw3_performance_traces as traces
 from robotbrain.grading.suites import hw3_performance_verdict as verdict
-from robotbrain.grading.suites.planner_bench import PlannerBench, open_room, walled_room, with_box
+from robotbrain.grading.suites.planner_bench import PlannerBench, open_room, walled_room, warm_students, with_box
 from robotbrain.ros.context import CallbackRecord
 
 suite = Suite("hw3_performance")
@@ -32,6 +32,7 @@ suite.exercise("validate", title="5.1 Is it really better?", points=10)
 
 # A student's planner that is not right yet must not spoil the repair: the kit's own stands in.
 suite.reference("ReusingPlanner", "robotbrain.pipeline.nodes.planner:PlannerNode")
+suite.warm_students(warm_students)
 suite.crosses(CallbackRecord)
 
 HELPERS = (

@@ -10,7 +10,7 @@ from robotbrain.grading import Student, Suite, expect
 from robotbrain.grading.suites import judging
 from robotbrain.grading.suites import lab_integration_planning as plans
 from robotbrain.grading.suites import lab_integration_tools as tools
-from robotbrain.grading.suites.planner_bench import PlannerBench, open_room, walled_room
+from robotbrain.grading.suites.planner_bench import PlannerBench, open_room, walled_room, warm_students
 
 suite = Suite("lab_integration")
 
@@ -38,6 +38,7 @@ suite.reference("inflate", lambda: plans.inflate)
 suite.reference("astar", "robotbrain.pipeline.planning:astar")
 suite.reference("smooth", "robotbrain.pipeline.planning:smooth")
 suite.reference("MyPlanner", "robotbrain.pipeline.nodes.planner:PlannerNode")
+suite.warm_students(warm_students)
 
 HELPERS = (
     "PoseBuffer",

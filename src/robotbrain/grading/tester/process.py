@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from robotbrain.grading.lab import Notice
+from robotbrain.grading.remote import rehearse
 from robotbrain.grading.remote.raised import StudentInterrupted
 from robotbrain.grading.report import Score
 from robotbrain.grading.runs import Runs
@@ -38,7 +39,8 @@ def prepare(autograder: str, labs: Sequence[str] = ()) -> None:
     for lab in labs:
         _, complete = suites_of(lab)
         steps: list[Callable[[], object]] = [functools.partial(complete.load_reference, n) for n in complete.references]
-        for warm in steps + complete.warmers:
+        steps += [*complete.warmers, functools.partial(rehearse, complete)]
+        for warm in steps:
             try:
                 warm()
             except Exception:  # the tests that need it will say so

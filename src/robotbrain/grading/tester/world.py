@@ -194,11 +194,13 @@ class RemoteWorld:
 
     def _ask(self, question: Callable[[TestersPeer], Answer], otherwise: Answer) -> Answer:
         """The answer to a question between tests; where the process ends at it, that of the next, or ``otherwise``."""
-        for _ in range(2):
+        for again in (False, True):
             if self._number in self._over:
                 break
             try:
                 with self.timed("", "", PREPARING_S):
+                    if again:  # an interrupt of the test before may still stand there
+                        self._peer().request("begin", self._suite.name, "")
                     return question(self._peer())
             except (StudentInterrupted, StudentLost):
                 continue
