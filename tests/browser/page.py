@@ -23,6 +23,7 @@ _STATE = f"""(path) => {{
   for (const cell of widget.model.cells) cells.push({{
     id: cell.id,
     type: cell.type,
+    source: cell.sharedModel.getSource(),
     count: cell.type === 'code' ? cell.executionCount : null,
     outputs: cell.type === 'code' ? cell.outputs.toJSON() : [],
   }});
@@ -68,7 +69,7 @@ class NotebookPage:
         self.page.locator(".lm-TabBar-tab.jp-mod-current").get_by_text(Path(path).name).wait_for()
 
     def state(self) -> dict[str, Any] | None:
-        """The kernel's status and the cells (id, type, count, outputs) of the notebook, once it is loaded."""
+        """The kernel's status and the cells (id, type, source, count, outputs) of the notebook, once it is loaded."""
         return self.page.evaluate(_STATE, self.path)  # type: ignore[no-any-return]
 
     def summary(self) -> str:
@@ -106,11 +107,49 @@ class NotebookPage:
         cell.scroll_into_view_if_needed()
         return cell
 
+    def replace(self, cell_id: str, text: str) -> None:
+        """Put the cursor into a code cell, mark everything in it, and type ``text`` over it, as from a clipboard."""
+        editor = self.show(cell_id).locator(".cm-content")
+        editor.click()
+        self.page.keyboard.press("ControlOrMeta+A")
+        self.page.keyboard.insert_text(text)
+        wait_until(lambda: self._cell(cell_id)["source"] == text, 20, f"the text in cell {cell_id}")
+
+    def run_cell(self, cell_id: str, timeout_s: float = 60) -> dict[str, Any]:
+        """Run a code cell with Control + Enter and return it with its outputs."""
+        before = self._cell(cell_id)["count"]
+        self.show(cell_id).locator(".cm-content").click()
+        self.page.keyboard.press("Control+Enter")
+
+        def done() -> bool:
+            state = self.state()
+            return bool(state and state["status"] == "idle" and self._cell(cell_id)["count"] not in (None, before))
+
+        wait_until(done, timeout_s, lambda: f"cell {cell_id} run; {self.summary()}")
+        return self._cell(cell_id)
+
+    def validate(self, timeout_s: float = 300) -> str:
+        """Press Validate and return what the dialog says."""
+        self.page.locator(".jp-NotebookPanel:visible .jp-NotebookPanel-toolbar").get_by_text("Validate").click()
+        dialog = self.page.locator(".jp-Dialog")
+        dialog.wait_for(state="visible", timeout=timeout_s * 1000)
+        return dialog.inner_text()
+
+    def _cell(self, cell_id: str) -> dict[str, Any]:
+        state = self.state()
+        assert state is not None, self.summary()
+        return next(cell for cell in state["cells"] if cell["id"] == cell_id)
+
     def save_screenshot(self, name: str) -> None:
-        """Keep a picture of the window where ``ROBOTBRAIN_SCREENSHOTS`` says, if it says."""
-        if folder := os.environ.get("ROBOTBRAIN_SCREENSHOTS"):
-            Path(folder).mkdir(parents=True, exist_ok=True)
-            self.page.screenshot(path=str(Path(folder) / f"{name}.png"))
+        """Keep a picture of the window; see :func:`keep`."""
+        keep(self.page, name)
+
+
+def keep(page: Page, name: str) -> None:
+    """Keep a picture of the window where ``ROBOTBRAIN_SCREENSHOTS`` says, if it says."""
+    if folder := os.environ.get("ROBOTBRAIN_SCREENSHOTS"):
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        page.screenshot(path=str(Path(folder) / f"{name}.png"))
 
 
 def wait_for_3d_view(cell: Locator, timeout_s: float = 60) -> Locator:

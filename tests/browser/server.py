@@ -22,6 +22,7 @@ import psutil
 T = TypeVar("T")
 
 TOKEN = "browser-test"
+WHOLE = os.environ.get("ROBOTBRAIN_PROOF") == "browser"  # `make proof-browser`: every lesson, every lab, every cell
 CHROMIUM_ARGUMENTS = (
     "--no-sandbox",
     "--disable-gpu",
@@ -70,7 +71,7 @@ def copy_course(repo: Path, target: Path) -> Path:
 
 
 @contextlib.contextmanager
-def serve(course: Path, scratch: Path) -> Iterator[LabServer]:
+def serve(course: Path, scratch: Path, *options: str) -> Iterator[LabServer]:
     """Run ``robotbrain lab`` on ``course`` as a user who never used Jupyter; on exit nothing of it is left running."""
     home = _home(scratch)
     port = free_port()
@@ -85,6 +86,7 @@ def serve(course: Path, scratch: Path) -> Iterator[LabServer]:
         str(port),
         "--directory",
         str(course),
+        *options,
     ]
     with log.open("wb") as output:
         process = psutil.Popen(
@@ -103,14 +105,16 @@ def wait_for_server(process: psutil.Popen, url: str, log: Path) -> None:
 
     def up() -> bool:
         if process.poll() is not None:
-            raise AssertionError(f"the server ended with {process.returncode}:\n{log.read_text(errors='replace')}")
+            raise AssertionError(
+                f"the server ended with {process.returncode}:\n{log.read_text(encoding='utf-8', errors='replace')}"
+            )
         try:
             with urllib.request.urlopen(f"{url}/api/status?token={TOKEN}", timeout=5) as reply:
                 return bool(reply.status == 200)
         except (urllib.error.URLError, OSError):
             return False
 
-    wait_until(up, 90, lambda: f"an answer from {url}\n{log.read_text(errors='replace')}")
+    wait_until(up, 90, lambda: f"an answer from {url}\n{log.read_text(encoding='utf-8', errors='replace')}")
 
 
 def end_tree(process: psutil.Popen) -> None:

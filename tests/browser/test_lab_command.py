@@ -38,7 +38,7 @@ def user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (config / name).write_text(json.dumps(content))
     monkeypatch.setenv("JUPYTER_CONFIG_DIR", str(config))
     monkeypatch.delenv("JUPYTER_CONFIG_PATH", raising=False)
-    for name, value in jupyter.server_environment(os.environ).items():
+    for name, value in jupyter.server_environment(os.environ, config).items():
         monkeypatch.setenv(name, value)
     monkeypatch.chdir(tmp_path)
     return config
@@ -87,8 +87,45 @@ def test_a_given_port_is_the_only_one_tried(course: Path) -> None:
 
 
 def test_other_configuration_folders_stay_on_the_search_path() -> None:
-    path = jupyter.server_environment({"JUPYTER_CONFIG_PATH": "theirs"})["JUPYTER_CONFIG_PATH"]
+    path = jupyter.server_environment({"JUPYTER_CONFIG_PATH": "theirs"}, Path("here"))["JUPYTER_CONFIG_PATH"]
     assert path.split(os.pathsep) == [str(jupyter.CONFIG), "theirs"]
+
+
+def test_instructor_gets_formgrader_on_the_courses_gradebook(course: Path) -> None:
+    path = jupyter.server_environment({}, course, instructor=True)["JUPYTER_CONFIG_PATH"].split(os.pathsep)
+    assert path[-3:] == [str(jupyter.INSTRUCTOR), str(course / "autograder"), str(jupyter.CONFIG)]
+    assert "--LabApp.default_url=/lab?formgrader=true" in jupyter.server_arguments(course, instructor=True)
+
+
+def test_a_students_copy_opens_no_formgrader(course: Path) -> None:
+    arguments = argparse.Namespace(directory=course, instructor=True, exchange=None, port=None, no_browser=True)
+    with pytest.raises(InputError, match="--instructor"):
+        jupyter.main(arguments)
+
+
+def test_exchange_that_is_named_must_be_there(course: Path) -> None:
+    arguments = argparse.Namespace(
+        directory=course, instructor=False, exchange=str(course / "no"), port=None, no_browser=True
+    )
+    with pytest.raises(InputError, match="exchange: got"):
+        jupyter.main(arguments)
+
+
+def test_assignment_list_fetches_into_labs_from_the_exchange(user: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from nbgrader.apps import NbGrader
+
+    for name, value in jupyter.server_environment({}, user, "/an/exchange").items():
+        monkeypatch.setenv(name, value)
+    app = NbGrader()
+    app.load_config_file()
+    assert (app.config.Exchange.root, app.config.Exchange.assignment_dir) == ("/an/exchange", str(user / "labs"))
+
+
+def test_on_windows_the_assignment_list_is_hidden(course: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jupyter.sys, "platform", "win32")
+    first = jupyter.server_environment({}, course)["JUPYTER_CONFIG_PATH"].split(os.pathsep)[0]
+    page = json.loads((Path(first) / "labconfig" / "page_config.json").read_text())
+    assert page["disabledExtensions"] == {"@jupyter/nbgrader:assignment-list": True}
 
 
 def test_validate_gets_the_kits_settings_and_keeps_the_users_others(user: Path) -> None:
@@ -124,6 +161,7 @@ def test_what_is_for_instructors_is_hidden_and_the_users_choices_stay(user: Path
     from jupyterlab_server.config import get_static_page_config
 
     disabled = get_static_page_config(level="all")["disabledExtensions"]
-    assert disabled["@jupyter/nbgrader:formgrader"] is True
+    assert disabled["@jupyter/nbgrader:formgrader"] is disabled["@jupyter/nbgrader:create-assignment"] is True
+    assert "@jupyter/nbgrader:assignment-list" not in disabled
     assert disabled["@jupyterlab/toc-extension"] is True
     assert "@jupyter/nbgrader:validate-assignment" not in disabled

@@ -10,6 +10,7 @@ import math
 import zipfile
 from pathlib import Path
 
+import nbformat
 import numpy as np
 import pytest
 from nbgrader.api import Gradebook
@@ -227,11 +228,28 @@ def test_manual_grades_and_comments_come_from_the_gradebook(gradebook: str, tmp_
     folder = tmp_path / "autograded"
     folder.mkdir()
     (folder / "toy.ipynb").write_text(json.dumps(made.notebook(made.answer("x = 1"))))
+    for name in feedback.CARRIED:  # nbgrader's exchange releases no feedback without these beside it
+        (folder / name).write_text(name)
     rows = graded_class(small_class()).rows[1:2]
     pages = feedback.write_feedback(tmp_path / "feedback", "toy", rows, lambda _: [folder / "toy.ipynb"], gradebook)
     assert pages == {"bilal": [tmp_path / "feedback" / "bilal" / "toy" / "toy.html"]}
+    assert [(pages["bilal"][0].parent / name).read_text() for name in feedback.CARRIED] == list(feedback.CARRIED)
     text = made.Page(pages["bilal"][0].read_text()).text
     assert "3.5 of 4 points" in text and "Graded by hand: 3 points" in text and "Nice <b>idea</b>." in text
+
+
+def test_answers_in_words_are_called_as_the_heading_above_them() -> None:
+    def words(name: str) -> nbformat.NotebookNode:
+        cell = nbformat.v4.new_markdown_cell("# my own heading")
+        cell.metadata["nbgrader"] = {"grade": True, "grade_id": name}
+        return cell
+
+    heading = nbformat.v4.new_markdown_cell("# Lab\ntext\n### Exercise 5.2: report (10 points, by hand)\nmore")
+    other = nbformat.v4.new_markdown_cell("## Part 6: the end")
+    cells = [words("early"), heading, words("one"), other, words("last-a"), words("last-b")]
+    titles = {"early": "Answer in words", "one": "5.2 Report"}
+    titles |= {"last-a": "Part 6: the end (a)", "last-b": "Part 6: the end (b)"}
+    assert feedback._titles({"cells": cells}) == titles
 
 
 NAMES = {"amara": "Diop, Amara", "bilal": "=cmd()", "chen": "Wei Chen", "=dagny": "D"}
@@ -279,10 +297,10 @@ def test_ids_are_exact_or_refused(roster: Path) -> None:
     rows = graded_class(small_class()).rows
     with pytest.raises(InputError, match="=dagny"):
         export.canvas(rows, "Toy lab")
-    roster.write_text("student,name\namara,x\namara,y\n")
+    roster.write_text("student,name\namara,x\namara,y\n", encoding="utf-8")
     with pytest.raises(InputError, match="each student once"):
         export.read_roster(roster)
-    roster.write_text("student,name\namara,x\n")
+    roster.write_text("student,name\namara,x\n", encoding="utf-8")
     with pytest.raises(InputError, match="bilal"):
         export.canvas(rows, "Toy lab", roster=export.read_roster(roster))
     with pytest.raises(InputError, match="folder"):

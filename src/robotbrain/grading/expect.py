@@ -10,6 +10,8 @@ import reprlib
 import sys
 from typing import Any
 
+from robotbrain.grading.likely import likely_slip
+
 _MISSING: Any = object()
 _LONGEST = 400  # characters of a shown value: more than fits a line, less than hides the message
 
@@ -174,7 +176,8 @@ def expect_close(
 ) -> None:
     """Fail the test unless ``got`` equals ``expected`` to within ``atol + rtol * |expected|``, element by element.
 
-    A wrong type, shape, length or a NaN is named as such. Infinities match infinities of the same sign, and a
+    A wrong type, shape, length or a NaN is named as such, and so is a usual slip (units, sign, order) where
+    ``misconception`` names none. Infinities match infinities of the same sign, and a
     NaN matches where ``expected`` has one.
     """
     import numpy as np
@@ -196,6 +199,7 @@ def expect_close(
             got=got,
             **kept,
         )
+    kept["misconception"] = misconception or likely_slip(numbers, target)
     if numbers.shape != target.shape:
         fail(
             f"{what} has shape {numbers.shape}, but shape {target.shape} is expected",

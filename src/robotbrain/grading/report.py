@@ -5,9 +5,11 @@ from __future__ import annotations
 import html
 import re
 import textwrap
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from robotbrain.grading.reread import Place, places
 from robotbrain.grading.results import TestResult, Verdict
 
 SCORE_MIME = "application/vnd.robotbrain.score+json"
@@ -72,12 +74,29 @@ class Report:
             notes.append("More tests run when the lab is graded.")
         return notes
 
+    def _places(self, result: TestResult) -> list[Place]:
+        return [] if result.passed else places(self.lab, self.exercise, result.reread, self.title)
+
+    def _details(self, result: TestResult) -> list[tuple[str, str]]:
+        reread = "; ".join(place.text for place in self._places(result)) or result.reread
+        pairs = [
+            ("", result.message),
+            ("given", result.given),
+            ("expected", result.expected),
+            ("got", result.got),
+            ("likely", result.misconception),
+            ("hint", result.hint),
+            ("reread", reread),
+            ("printed", result.printed.strip()[:300]),
+        ]
+        return [(label, text) for label, text in pairs if text]
+
     def __repr__(self) -> str:
         lines = [f"{self.title}: {_points(self.earned)} of {self.points:g} points"]
         for result in self.results:
             head = f"{result.verdict.symbol} {result.name} ({_points(result.earned)}/{result.points:g})"
             lines.append(f"  {head}: {result.verdict.label}")
-            for label, text in _details(result):
+            for label, text in self._details(result):
                 first, *rest = [
                     line for part in text.splitlines() for line in textwrap.wrap(part, _WIDTH - 18) or [""]
                 ] or [""]
@@ -88,7 +107,7 @@ class Report:
 
     def _repr_html_(self) -> str:
         share = "all tests passed" if self.full else f"{_points(self.earned)} of {self.points:g} points"
-        rows = "".join(_row(result) for result in self.results)
+        rows = "".join(_row(result, self._details(result), self._places(result)) for result in self.results)
         notes = "".join(f'<p style="margin:6px 0 0">{html.escape(note)}</p>' for note in self._notes())
         head = "".join(
             f'<th scope="col" style="text-align:left;padding:4px 8px">{h}</th>' for h in ("Test", "Result", "Points")
@@ -103,25 +122,13 @@ class Report:
         )
 
 
-def _details(result: TestResult) -> list[tuple[str, str]]:
-    pairs = [
-        ("", result.message),
-        ("given", result.given),
-        ("expected", result.expected),
-        ("got", result.got),
-        ("likely", result.misconception),
-        ("hint", result.hint),
-        ("reread", result.reread),
-        ("printed", result.printed.strip()[:300]),
-    ]
-    return [(label, text) for label, text in pairs if text]
-
-
-def _row(result: TestResult) -> str:
+def _row(result: TestResult, details: Sequence[tuple[str, str]], reread: Sequence[Place]) -> str:
     colour = _COLOURS.get(result.verdict, _FAILED_COLOUR)
-    details = "".join(
-        f'<div style="margin:2px 0 2px 1.2em">{f"<b>{label}:</b> " if label else ""}{_text_html(label, text)}</div>'
-        for label, text in _details(result)
+    links = "; ".join(f'<a href="{html.escape(place.href)}">{html.escape(place.text)}</a>' for place in reread)
+    told = "".join(
+        f'<div style="margin:2px 0 2px 1.2em">{f"<b>{label}:</b> " if label else ""}'
+        f"{links if label == 'reread' and links else _text_html(label, text)}</div>"
+        for label, text in details
     )
     cell = "padding:4px 8px;vertical-align:top;text-align:left;border-top:1px solid #d0d0d0"
     hidden = " <i>(hidden)</i>" if result.hidden else ""
@@ -130,7 +137,7 @@ def _row(result: TestResult) -> str:
         f'<td style="{cell};white-space:nowrap;color:{colour};font-weight:bold">'
         f"{result.verdict.symbol} {result.verdict.label}</td>"
         f'<td style="{cell};white-space:nowrap">{_points(result.earned)} / {result.points:g}</td></tr>'
-        + (f'<tr><td colspan="3" style="padding:0 8px 6px;text-align:left">{details}</td></tr>' if details else "")
+        + (f'<tr><td colspan="3" style="padding:0 8px 6px;text-align:left">{told}</td></tr>' if told else "")
     )
 
 

@@ -7,6 +7,8 @@ the students' *Fetch Feedback* all lead to it.
 from __future__ import annotations
 
 import contextlib
+import re
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +16,7 @@ from typing import Any
 
 import nbformat.v4
 
-from robotbrain.files import write_text
+from robotbrain.files import write_bytes, write_text
 from robotbrain.grading.intake.cells import REPAIRS_ID
 from robotbrain.grading.marks import Mark, Marks, marks_of
 from robotbrain.grading.report import SCORE_MIME
@@ -25,6 +27,9 @@ from robotbrain.grading.reports.page import render
 from robotbrain.grading.results import TestResult, Verdict
 
 STEPS = 3
+CARRIED = ("timestamp.txt", "submission_secret.txt")
+"""What nbgrader's exchange puts beside a submission, and looks for beside its feedback."""
+_HEADING = re.compile(r"^#+ (?:Exercise ([\d.]+): )?(.+?)(?: \([^()]*\))?$", re.MULTILINE)
 _EMPTY_COMMENT = "No response."  # nbgrader's own, on answers nobody wrote
 
 
@@ -126,6 +131,8 @@ def _step(exercise: ExerciseView) -> Step:
     failed = [t for t in exercise.tests if not t.passed]
     # A visible test with a hint tells most; then a hidden one with a hint; then whatever there is.
     told = sorted(failed, key=lambda t: (not (t.hint or t.misconception), t.hidden))
+    if not told and exercise.manual is not None:
+        return Step(exercise.title, exercise.anchor, "graded by hand; see the comments there", "", "", gain)
     if not told:
         return Step(exercise.title, exercise.anchor, exercise.error or "it gave no score", "", "", gain)
     first = told[0]
@@ -163,15 +170,21 @@ def _belongs(name: str, marks: Sequence[Mark]) -> bool:
 
 
 def _titles(notebook: Mapping[str, Any]) -> dict[str, str]:
-    """Titles of the exercises, from the reports in their graded cells."""
-    found = {}
+    """Titles of the exercises: from the reports in their graded cells, and for answers in words from the heading."""
+    found, heading = {}, ""
     for cell in notebook["cells"]:
         label = cell["metadata"].get("nbgrader") or {}
+        if label.get("grade") and cell["cell_type"] == "markdown":
+            found[str(label.get("grade_id"))] = heading or "Answer in words"
+        elif cell["cell_type"] == "markdown" and (lines := _HEADING.findall(cell["source"])):
+            number, words = lines[-1]
+            heading = f"{number} {words[:1].upper()}{words[1:200]}".strip()
         for output in cell.get("outputs") or []:
             report = (output.get("data") or {}).get(SCORE_MIME)
             if label.get("grade") and isinstance(report, Mapping) and isinstance(report.get("title"), str):
                 found[str(label.get("grade_id"))] = report["title"][:200]
-    return found
+    shared = {title for title, uses in Counter(found.values()).items() if uses > 1}  # several answers, one heading
+    return {k: f"{title} ({k.rpartition('-')[2]})" if title in shared else title for k, title in found.items()}
 
 
 def _repairs(notebook: Mapping[str, Any]) -> list[str]:
@@ -207,4 +220,7 @@ def write_feedback(
                 page = feedback_page(row, notebook, lab=lab, graded=graded, only=own)
                 target = folder / row.student / lab / f"{path.stem}.html"
                 written.setdefault(row.student, []).append(write_text(target, page))
+                for name in CARRIED:  # as nbgrader's own step does: it releases no feedback without them
+                    if (path.parent / name).is_file():
+                        write_bytes(target.parent / name, (path.parent / name).read_bytes())
     return written
