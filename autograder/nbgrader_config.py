@@ -6,7 +6,7 @@ from pathlib import Path
 
 from nbgrader.converters import GenerateAssignment
 
-from robotbrain.grading.nbgrader_plugins import CanonicalForm, HealingExporter, ResilientExecute
+from robotbrain.grading.nbgrader_plugins import CanonicalForm, GuardedCollect, HealingExporter, ResilientExecute
 from robotbrain.grading.reports.exporter import ATTRIBUTES, TAGS, FeedbackExporter, harmless_html
 
 c = get_config()
@@ -23,6 +23,11 @@ c.CourseDirectory.submitted_directory = "autograder/submitted"
 c.CourseDirectory.autograded_directory = "autograder/autograded"
 c.CourseDirectory.feedback_directory = "autograder/feedback"
 c.CourseDirectory.db_url = f"sqlite:///{(HERE / 'gradebook.db').as_posix()}"
+
+# The folder that students fetch from and hand in to; `robotbrain exchange where` says which one it is otherwise.
+if exchange := os.environ.get("ROBOTBRAIN_EXCHANGE"):
+    c.Exchange.root = exchange
+c.ExchangeFactory.collect = GuardedCollect  # nbgrader's own follows links, and takes what others hand in in your name
 
 # Submissions are read so that a damaged file still gets a grade, and run so that one cell cannot spoil the rest.
 c.Autograde.exporter_class = HealingExporter

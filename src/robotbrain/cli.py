@@ -41,11 +41,15 @@ COMMANDS: dict[str, Command] = {
     "grade-class": Command("robotbrain.grading.commands:grade_class", "grade all submissions of a lab"),
     "report": Command("robotbrain.grading.reports.commands:report", "pages and tables of a graded class, exports"),
     "generate": Command("robotbrain.grading.commands:generate", "make the students' version of a lab"),
+    "exchange": Command(
+        "robotbrain.grading.exchange_commands:exchange", "hand labs out, take submissions in, feedback"
+    ),
+    "bundle": Command("robotbrain.bundle.commands:bundle", "the course as a zip for students, without the key"),
     "sample-class": Command("robotbrain.grading.commands:sample_class", "make submissions to try grading on"),
     "mutation-test": Command("robotbrain.grading.commands:mutation_test", "test the tests of a lab"),
     "assessment": Command("robotbrain.assessment.commands:assessment", "draw papers for a class, check the bank"),
     "notebooks": Command("robotbrain.notebooks", "check or fix the stored form of notebooks"),
-    "doctor": Command("robotbrain.grading.doctor", "say what is installed and what is missing"),
+    "doctor": Command("robotbrain.doctor.commands:doctor", "what is wrong with this installation, and how to mend it"),
 }
 
 

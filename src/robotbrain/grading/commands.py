@@ -67,7 +67,9 @@ def grade_class_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``robotbrain grade-class``."""
     parser.add_argument("lab")
     parser.add_argument("--submitted", type=Path, metavar="DIR", help="folder with <student>/<lab>/ in it")
-    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="submissions that run at the same time")
+    parser.add_argument(
+        "--jobs", type=int, metavar="N", help="submissions that run at the same time (default: two per core)"
+    )
     parser.add_argument("--out", type=Path, metavar="DIR", help="grade into a folder of its own, not the gradebook")
     parser.add_argument(
         "--db-url",
@@ -93,9 +95,10 @@ def grade_class_main(arguments: argparse.Namespace) -> int:
     from robotbrain.grading.classroom import Options, grade_class, progress_bar
     from robotbrain.grading.course import find_course
     from robotbrain.grading.marks import table
+    from robotbrain.grading.scheduler import fitting_workers
 
     options = Options(
-        workers=arguments.jobs,
+        workers=fitting_workers() if arguments.jobs is None else arguments.jobs,
         limits=_limits(arguments),
         fresh=arguments.fresh,
         require_sandbox=arguments.require_sandbox,

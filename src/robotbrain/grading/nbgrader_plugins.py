@@ -1,6 +1,7 @@
 """What the kit puts in place of nbgrader's own classes; the configuration in ``autograder/`` names them.
 
-``ResilientExecute`` replaces ``Execute``; ``HealingExporter`` reads submissions that nbgrader could not. Everything
+``ResilientExecute`` replaces ``Execute``; ``HealingExporter`` reads submissions that nbgrader could not;
+``GuardedCollect`` takes from the exchange what belongs to the student that it names, and follows no links. Everything
 else (overwriting of locked cells, the gradebook, formgrader, feedback) stays stock.
 """
 
@@ -12,11 +13,14 @@ from typing import Any
 
 from nbconvert.exporters import NotebookExporter
 from nbformat.notebooknode import NotebookNode
+from nbgrader.exchange.default import ExchangeCollect
 from nbgrader.preprocessors import NbGraderPreprocessor
+from nbgrader.utils import parse_utc
 from traitlets import Bool, Float, Integer
 
 from robotbrain.grading import intake
 from robotbrain.grading.bench import shared_bench
+from robotbrain.grading.collecting import entries, take
 from robotbrain.grading.execute import Limits
 from robotbrain.grading.sandbox.layers import warning_of
 from robotbrain.grading.suite import AUTOGRADER_VARIABLE
@@ -87,3 +91,28 @@ class HealingExporter(NotebookExporter):  # type: ignore[misc]
         folder = Path(course.format_path(course.source_directory, ".", names["assignment"]))
         path = folder / f"{names['notebook']}.ipynb"
         return path if path.is_file() else None
+
+
+class GuardedCollect(ExchangeCollect):  # type: ignore[misc]
+    """Collects as nbgrader does, also by formgrader's button, but trusts nothing that lies in the exchange."""
+
+    def copy_files(self) -> None:
+        """Copy each student's newest submission (the newest in time, if ``before_duedate``), unless it is here."""
+        lab, chosen = self.coursedir.assignment_id, self.coursedir.student_id
+        newest = {}
+        for entry in entries(Path(self.inbound_path), lab):
+            late = self.before_duedate and self.duedate and parse_utc(entry.stamp) > self.duedate
+            if self.check_owner and not entry.own:
+                self.log.warning("%s is left: it belongs to %s", entry.path.name, entry.owner)
+            elif chosen in ("", "*", entry.student) and not (late and entry.student in newest):
+                newest[entry.student] = entry
+        for student, entry in newest.items():
+            target = Path(self.coursedir.format_path(self.coursedir.submitted_directory, student, lab))
+            here = self.coursedir.get_existing_timestamp(str(target)) if target.is_dir() else None
+            if target.is_dir() and not (self.update and (here is None or parse_utc(entry.stamp) > here)):
+                continue
+            try:
+                for sentence in take(entry, target):
+                    self.log.warning("%s: left out: %s", student, sentence)
+            except OSError as error:
+                self.log.error("%s cannot be read: %s", entry.path.name, error.strerror)
