@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint format lab labs book train bench profiles proof-drive proof-devices proof-bottlenecks proof-reach proof-velocity proof-gap conformance-ros conformance-isaaclab conformance-tensorrt proof-optimisation mutation-test attacks proof-grading clean
+.PHONY: help install demo test lint format lab labs book proof-book proof-notebooks proof-browser proof-hub bundle train bench profiles proof-drive proof-devices proof-bottlenecks proof-reach proof-velocity proof-gap conformance-ros conformance-isaaclab conformance-tensorrt proof-optimisation mutation-test attacks proof-grading clean
 
 help:  ## Show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-15s %s\n", $$1, $$2}'
@@ -42,6 +42,10 @@ lab: $(STAMP)  ## Open JupyterLab on the course
 book: $(STAMP)  ## Make a static site of the course, outputs included (five minutes the first time)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[book]"
 	$(BIN)/python book/build.py
+
+proof-book: book  ## Let a browser read every page of the book: links, accessibility, search, replays, times (half an hour)
+	ROBOTBRAIN_NO_SKIP=1 ROBOTBRAIN_BOOK=$(CURDIR)/book/_build/html $(BIN)/python -m pytest tests/test_book.py
+	$(BIN)/python benchmarks/book.py
 
 labs: $(STAMP)  ## Generate labs/ from solutions/
 	$(BIN)/robotbrain generate
@@ -95,6 +99,19 @@ profiles: $(STAMP)  ## Calibrate the Jetson twin and write the reference profile
 mutation-test: $(STAMP)  ## Test the tests of the labs with named wrong solutions
 	$(BIN)/robotbrain mutation-test --all --jobs 2
 
+proof-notebooks: $(STAMP)  ## Run every notebook from a clean kernel beside the time that it states (a quarter of an hour; resumes)
+	$(BIN)/python benchmarks/notebooks.py --write
+
+proof-browser: $(STAMP)  ## The whole course in a browser: every lesson, and every lab from stub to feedback (an hour)
+	ROBOTBRAIN_PROOF=browser $(BIN)/python -m pytest tests/browser/test_jupyterlab.py tests/browser/test_walk.py
+
+proof-hub: $(STAMP)  ## A class on a genuine JupyterHub with three accounts (Linux, root, node; about two minutes)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[hub]"
+	$(BIN)/python -m tests.hub
+
+bundle: $(STAMP)  ## The course as a zip for students, without the key
+	$(BIN)/robotbrain bundle
+
 attacks: $(STAMP)  ## Try every attack on the grader, in all its variants (ten minutes)
 	ROBOTBRAIN_ATTACKS=all $(BIN)/python -m pytest tests/grading/attacks
 
@@ -111,6 +128,7 @@ bench: $(STAMP)  ## Run the benchmarks; each prints one table
 	$(BIN)/python benchmarks/jitter.py
 	$(BIN)/python benchmarks/monitoring_overhead.py
 	$(BIN)/python benchmarks/rl_stepping.py
+	$(BIN)/python benchmarks/checks.py
 
 clean:  ## Remove .venv, caches and generated pages
-	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache demo build dist
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache demo build dist book/_build

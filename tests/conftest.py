@@ -27,6 +27,7 @@ SLOW_FILES = (
     "test_hw2_optimisation.py",
     "test_lab_integration.py",
     "test_hw3_performance.py",
+    "test_capstone.py",
     "test_labs_remote_a.py",
     "test_attacks.py",
 )

@@ -18,7 +18,7 @@ def messy(path: Path) -> Path:
     code.metadata.update({"scrolled": True, "tags": ["keep"], "execution": {"iopub.status.busy": "now"}})
     notebook.cells[2]["id"] = code["id"]
     notebook.metadata = nbformat.from_dict({"kernelspec": {"name": "mine"}, "widgets": {}, "title": "T"})
-    path.write_text(json.dumps(notebook))
+    path.write_text(json.dumps(notebook), encoding="utf-8")
     return path
 
 

@@ -7,18 +7,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from robotbrain.figures import BLUE, GREEN, GREY, INK, MAUVE, VERMILLION
 from robotbrain.sim.robot import CHASSIS_RADIUS, LIDAR_HEIGHT
 from robotbrain.sim.world import MARKER_MAT_RADIUS, Obstacle, World
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Okabe and Ito's colour-blind-safe colours; kinds also differ by hatching, so the figure works in grey.
+# Kinds also differ by hatching, so the figure works in grey.
 _STYLE: dict[str, dict[str, Any]] = {
-    "wall": {"facecolor": "#444444"},
-    "shelf or barrier": {"facecolor": "#999999"},
-    "tall box": {"facecolor": "#56B4E9", "hatch": "//"},
-    "low box (camera only)": {"facecolor": "#F0E442", "hatch": "xx"},
+    "wall": {"facecolor": INK},
+    "shelf or barrier": {"facecolor": GREY},
+    "tall box": {"facecolor": "#B9DDF6", "hatch": "//"},
+    "low box (camera only)": {"facecolor": "#FFF6B0", "hatch": "xx"},
 }
 
 
@@ -61,17 +62,13 @@ def plot_topdown(
         seen.add(label)
         ax.add_patch(Polygon([(x, y) for x, y in o.corners()], edgecolor="black", lw=0.6, label=shown, **_STYLE[label]))
     goal, start = world.goal, world.start
-    ax.add_patch(
-        Circle((goal.x, goal.y), MARKER_MAT_RADIUS, facecolor="#CC79A7", edgecolor="black", label="goal marker")
-    )
-    ax.add_patch(
-        Circle((start.x, start.y), CHASSIS_RADIUS, facecolor="#009E73", edgecolor="black", label="robot at start")
-    )
+    ax.add_patch(Circle((goal.x, goal.y), MARKER_MAT_RADIUS, facecolor=MAUVE, edgecolor="black", label="goal marker"))
+    ax.add_patch(Circle((start.x, start.y), CHASSIS_RADIUS, facecolor=GREEN, edgecolor="black", label="robot at start"))
     nose = CHASSIS_RADIUS * 2.0
     ax.plot([start.x, start.x + nose * np.cos(start.yaw)], [start.y, start.y + nose * np.sin(start.yaw)], "k-", lw=1.5)
     for points, colour, dashes, label in (
-        (plan, "#0072B2", "--", "planned path"),
-        (path, "#D55E00", "-", "driven path"),
+        (plan, BLUE, "--", "planned path"),
+        (path, VERMILLION, "-", "driven path"),
     ):
         if points is not None:
             xy = np.asarray(points, float)
