@@ -30,6 +30,7 @@ SLOW_FILES = (
     "test_capstone.py",
     "test_labs_remote_a.py",
     "test_attacks.py",
+    "test_book.py",
 )
 """Files that take minutes: with two workers (pytest-xdist) they must not be left for the end."""
 
