@@ -48,7 +48,11 @@ def build(source: Path, out: Path, cache: Path | None) -> int:
     """
     mode = "cache" if cache else "off"
     environment = os.environ | {"ROBOTBRAIN_BOOK_EXECUTION": mode, "ROBOTBRAIN_BOOK_CACHE": str(cache or "")}
-    environment |= {"OMP_NUM_THREADS": "1", "MPLBACKEND": "module://matplotlib_inline.backend_inline"}
+    environment |= {
+        "OMP_NUM_THREADS": "1",
+        "ROBOTBRAIN_NO_PROGRESS": "1",
+        "MPLBACKEND": "module://matplotlib_inline.backend_inline",
+    }
     shutil.rmtree(out, ignore_errors=True)  # no page stays whose source is gone
     executed = out.parent / "jupyter_execute"
     shutil.rmtree(executed, ignore_errors=True)

@@ -17,6 +17,7 @@ from robotbrain.jetson.profiles import JetsonProfile, default_network, load_prof
 from robotbrain.pipeline.costs import ProfileCosts
 from robotbrain.pipeline.deployment import Deployment
 from robotbrain.pipeline.watch import Watch
+from robotbrain.progress import bar
 
 if TYPE_CHECKING:
     from rclpy.node import Node
@@ -261,7 +262,8 @@ def drive(
                 costs.assign(node.get_fully_qualified_name(), role, foreign=role in (parts or {}))
         began = time.perf_counter()
         try:
-            reason, success = _run(context, sim, watch, time_limit)
+            with bar(f"driving in world {world.spec.seed}", time_limit, "s at most") as progress:
+                reason, success = _run(context, sim, watch, time_limit, progress)
         finally:
             context.try_shutdown()
         wall_seconds = time.perf_counter() - began
@@ -309,11 +311,12 @@ def _chosen_profile(profile: str | JetsonProfile, mode: str | int | None) -> Jet
     return profile
 
 
-def _run(context: Any, sim: RobotSim, watch: Watch, time_limit: float) -> tuple[str, bool]:
+def _run(context: Any, sim: RobotSim, watch: Watch, time_limit: float, progress: Any) -> tuple[str, bool]:
     step_ns = 100_000_000
     while context.now_ns < time_limit * 1e9:
         context.run_until(context.now_ns + step_ns)
         sim.advance_to(context.now_ns)
+        progress.update(step_ns * 1e-9)
         watch.sample(sim, context.now_ns * 1e-9)
         if sim.truth.collided:
             return "touched " + ", ".join(sorted(sim.truth.collided)), False
