@@ -88,6 +88,7 @@ GUARDED: dict[str, dict[str, str]] = {
     },
     "src/robotbrain/grading/sandbox/process.py": {"pidfd_open": "in snapshots of a fork server"},
     "src/robotbrain/grading/sandbox/recipes.py": {"geteuid": "if bubblewrap is there"},
+    "src/robotbrain/grading/scheduler.py": {"sched_getaffinity": "hasattr"},
     "src/robotbrain/grading/tester/process.py": {"resource": "ImportError is caught"},
     _JITTER: {
         "resource": "if the kernel is Linux",

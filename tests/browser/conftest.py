@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ..conftest import need
+from .page import keep
 from .server import CHROMIUM_ARGUMENTS
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser
+    from playwright.sync_api import Browser, Page
 
 
 @pytest.fixture(scope="module")
@@ -24,3 +25,13 @@ def browser(chromium: str) -> Iterator[Browser]:
         running = playwright.chromium.launch(executable_path=chromium, args=list(CHROMIUM_ARGUMENTS))
         yield running
         running.close()
+
+
+@pytest.fixture
+def page(browser: Browser, request: pytest.FixtureRequest) -> Iterator[Page]:
+    """An empty page of its own; what it shows at the end is kept."""
+    context = browser.new_context(viewport={"width": 1400, "height": 900})
+    opened = context.new_page()
+    yield opened
+    keep(opened, f"last_{request.node.name}")
+    context.close()

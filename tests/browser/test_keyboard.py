@@ -18,7 +18,7 @@ from .page import NotebookPage, keep
 from .server import LabServer, copy_course, serve, wait_until
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Page
+    from playwright.sync_api import Page
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(600)]
 
@@ -49,15 +49,6 @@ def server(repo: Path, chromium: str, tmp_path_factory: pytest.TempPathFactory) 
     scratch = tmp_path_factory.mktemp("keyboard")
     with serve(copy_course(repo, scratch / "course"), scratch) as running:
         yield running
-
-
-@pytest.fixture
-def page(browser: Browser, request: pytest.FixtureRequest) -> Iterator[Page]:
-    context = browser.new_context(viewport={"width": 1400, "height": 900})
-    opened = context.new_page()
-    yield opened
-    keep(opened, f"last_{request.node.name}")
-    context.close()
 
 
 def press_until(

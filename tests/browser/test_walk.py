@@ -26,7 +26,7 @@ from .page import NotebookPage, keep
 from .server import WHOLE, LabServer, copy_course, serve, user_environment, wait_until
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Locator, Page
+    from playwright.sync_api import Locator, Page
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(1800)]
 
@@ -78,15 +78,6 @@ def walk(
     exchange.mkdir()
     with serve(course, scratch / "student", "--exchange", str(exchange)) as server:
         yield Walk(lab, repo, server, teacher, exchange)
-
-
-@pytest.fixture
-def page(browser: Browser, request: pytest.FixtureRequest) -> Iterator[Page]:
-    context = browser.new_context(viewport={"width": 1400, "height": 900})
-    opened = context.new_page()
-    yield opened
-    keep(opened, f"last_{request.node.name}")
-    context.close()
 
 
 def assignment_list(page: Page, server: LabServer) -> Locator:

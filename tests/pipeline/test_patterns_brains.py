@@ -220,7 +220,7 @@ def test_no_brain_beats_its_bound(costs, cores, period, kind, at_once):
     if form.accuracy == "bound":
         assert result.latency_ns.min() >= form.latency_ns
         assert result.mean_age_ms * MS >= form.latency_ns
-        assert result.plan_age_ms.min() * MS >= form.plan_age_ns
+        assert round(result.plan_age_ms.min() * MS) >= form.plan_age_ns  # a float in ms; the other counts ns
         path = stages if kind == "pipelined" else [*stages[:-2], stages[-1]]
         assert form.latency_ns == sum(stage.ns for stage in path)
 

@@ -6,7 +6,6 @@ tests' own process.
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,7 +19,7 @@ from robotbrain.errors import InputError
 from robotbrain.grading import expect, fail
 from robotbrain.grading.suites import hw2_optimisation_judge as scenes
 from robotbrain.grading.suites import hw2_optimisation_network as network_file
-from robotbrain.grading.suites import judging
+from robotbrain.grading.suites import judging, policy_file
 from robotbrain.grading.suites.capstone_probes import whose_planner
 from robotbrain.grading.suites.hw1_rl_evidence import exact_bound
 from robotbrain.pipeline.capstone import BRIEF
@@ -144,14 +143,7 @@ def judge_scenes(student: Student, seeds: Sequence[int], looks: Sequence[tuple[i
 def load_policy(student: Student) -> OnnxPolicy:
     """Return the policy in the file that was handed in, or fail and say what it is instead."""
     name = file_name(student, "POLICY")
-    path = student.files / name
-    if not path.is_file():
-        fail(f"there is no file {name} beside the notebook", hint="file-beside-the-notebook")
-    try:
-        state = path.stat()
-        policy = _opened(path, (state.st_ino, state.st_size, state.st_mtime_ns))
-    except InputError as error:
-        fail(f"{name} cannot be used: {error.what}", got=error.given, expected=error.expected, hint="not-a-policy")
+    policy = policy_file.handed_in(student, name)
     try:
         spec.check_meta(policy.meta)
     except InputError as error:
@@ -160,18 +152,10 @@ def load_policy(student: Student) -> OnnxPolicy:
     return policy
 
 
-@functools.lru_cache(maxsize=4)
-def _opened(path: Path, _state: tuple[int, ...]) -> OnnxPolicy:
-    """Return the policy in a file; read, checked and opened once for all tests."""
-    from robotbrain.rl.onnx_policy import OnnxPolicy
-
-    return OnnxPolicy(path)
-
-
 def check_own_policy(student: Student) -> None:
     """Fail if the policy does what the kit's does."""
     obs = np.random.default_rng(3).uniform(-1, 1, (64, sum(size for _, size in spec.OBSERVATIONS)))
-    kits = _opened(spec.default_policy(), ())
+    kits = policy_file.opened(spec.default_policy())
     mine, theirs = (policy.meta.clip(policy(obs)) for policy in (load_policy(student), kits))
     apart = float(np.abs(mine - theirs).mean())
     expect(apart > SAME_POLICY, "this is the starter policy", given="64 made-up observations",
@@ -310,5 +294,5 @@ def stand_in_planner() -> Any:
 def warm() -> None:
     """Import, compile and cache what judging needs."""
     scenes.warm()
-    rooms(_opened(spec.default_policy(), ()), 2, 0)
+    rooms(policy_file.opened(spec.default_policy()), 2, 0)
     predict(Path(spec.__file__).parents[2] / "optimisation" / "weights" / "student.onnx", "int8")

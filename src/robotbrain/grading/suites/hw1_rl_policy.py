@@ -17,6 +17,7 @@ import numpy as np
 from robotbrain.errors import InputError
 from robotbrain.grading import expect, fail
 from robotbrain.grading.suites import hw1_rl_probes as probes
+from robotbrain.grading.suites import policy_file
 from robotbrain.grading.suites.hw1_rl_evidence import exact_bound
 
 if TYPE_CHECKING:
@@ -58,28 +59,13 @@ def load(student: Any, name: Any) -> OnnxPolicy:
     if not isinstance(name, str) or Path(name).name != name:
         fail("the name of the policy file should be a plain file name", got=name, expected='"reach_policy.onnx"',
              hint="file-beside-the-notebook")  # fmt: skip
-    path = student.files / name
-    if not path.is_file():
-        fail(f"there is no file {name} beside the notebook", hint="file-beside-the-notebook")
-    try:
-        state = path.stat()
-        policy = _opened(path, (state.st_ino, state.st_size, state.st_mtime_ns))
-    except InputError as error:
-        fail(f"{name} cannot be used: {error.what}", got=error.given, expected=error.expected, hint="not-a-policy")
+    policy = policy_file.handed_in(student, name)
     meta = policy.meta
     expect(meta.task == "reach", f"{name} holds a policy for another task", got=meta.task, expected="reach",
            hint="another-robot")  # fmt: skip
     expect(abs(meta.control_dt - CONTROL_DT) < 1e-9, f"{name} holds a policy for another control rate",
            got=f"control_dt = {meta.control_dt:g} s", expected=f"{CONTROL_DT:g} s", hint="control-rate")  # fmt: skip
     return policy
-
-
-@functools.lru_cache(maxsize=4)
-def _opened(path: Path, _state: tuple[int, ...]) -> OnnxPolicy:
-    """Return the policy in a file; read, checked and opened once for all tests."""
-    from robotbrain.rl.onnx_policy import OnnxPolicy
-
-    return OnnxPolicy(path)
 
 
 def episodes(policy: OnnxPolicy, serials: Sequence[int], seed: int, *, nominal: bool) -> ReachEpisodes:
