@@ -74,7 +74,7 @@ def test_every_hint_and_every_mutant_is_of_use(repo: Path, suite: Suite) -> None
     assert {m.hint for m in mutants} <= set(suite.hints)
     assert {m.exercise for m in mutants} == set(suite.exercises)
     parts = ("", "_evidence", "_learning", "_memory", "_policy", "_probes", "_tools")
-    files = [f"src/robotbrain/grading/suites/{LAB}{part}.py" for part in parts]
+    files = [f"src/robotbrain/grading/suites/{name}.py" for name in (*(LAB + part for part in parts), "policy_file")]
     tests = "".join((repo / name).read_text(encoding="utf-8") for name in [*files, f"autograder/hidden/{LAB}.py"])
     assert [key for key in suite.hints if tests.count(f'"{key}"') < 2] == []
 
