@@ -8,6 +8,7 @@ and all its cells are run.
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 import subprocess
 import sys
@@ -219,8 +220,15 @@ def test_feedback_is_fetched_and_opened_by_the_student(page: Page, walk: Walk) -
     shown = assignment_list(page, walk.student)
     submitted = shown.locator("#submitted_assignments_list .list_item", has_text=walk.lab).first
     submitted.get_by_role("button", name="Fetch Feedback").click()
-    shown.get_by_text("view feedback").first.click()
-    page.locator(".jp-DirListing-item", has_text=f"{walk.lab}.html").dblclick()
+    from playwright.sync_api import TimeoutError as PlaywrightTimeout
+
+    file = page.locator(".jp-DirListing-item", has_text=f"{walk.lab}.html")
+    for _ in range(6):  # the link does nothing while JupyterLab still restores the folder that was last open
+        shown.get_by_text("view feedback").first.click()
+        with contextlib.suppress(PlaywrightTimeout):
+            file.wait_for(timeout=10_000)
+            break
+    file.dblclick()
     feedback = page.frame_locator(".jp-HTMLViewer:visible iframe")
     feedback.locator("h1", has_text="Feedback on").wait_for(timeout=60_000)
     keep(page, f"{walk.lab}_feedback")

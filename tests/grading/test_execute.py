@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import itertools
 import os
 import subprocess
 import sys
 import tempfile
+import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 from nbformat.v4 import new_code_cell, new_notebook, output_from_msg
 
@@ -19,7 +24,7 @@ from robotbrain.grading.execute import Execution, Limits, make_gradable
 from robotbrain.grading.marks import Mark, marks_of
 from robotbrain.grading.outputs import CellOutputs
 from robotbrain.grading.report import SCORE_MIME
-from robotbrain.grading.scoring import Question, question_of
+from robotbrain.grading.scoring import Question, Scorer, question_of
 from tests.grading import toylab
 
 FAST = Limits(cell_s=1.5, graded_s=8.0, grace_s=0.5, wall_s=60.0, output_bytes=100_000)
@@ -61,6 +66,33 @@ def test_the_solution_gets_everything_and_training_is_skipped(bench: Bench, heal
     assert points(marks) == [4.0, 6.0, 5.0]
     assert incidents == []
     assert "not run while grading" in healed.notebook.cells[-1].outputs[0].text
+
+
+@pytest.mark.parametrize("question", [2, 5])  # those about `mean`
+def test_a_fork_server_killed_during_the_tests_costs_nothing(
+    light_bench: Callable[..., Bench], heal: Any, monkeypatch: pytest.MonkeyPatch, question: int
+) -> None:
+    judge, asked, killers = Scorer._judge, itertools.count(), list[threading.Timer]()
+
+    def _judge(scorer: Scorer, graded: Any, *, hidden: bool) -> None:
+        if next(asked) == question:
+            killers.append(threading.Timer(0.2, lambda: [kill(p) for p in servers]))
+            killers[0].start()
+        judge(scorer, graded, hidden=hidden)
+
+    monkeypatch.setattr(Scorer, "_judge", _judge)
+    slow = toylab.SOLUTIONS["mean"].replace(":\n", ":\n    import time; time.sleep(0.5)\n", 1)
+    before = set(psutil.Process().children(recursive=True))
+    with light_bench(limits=FAST) as bench:
+        bench.layers  # noqa: B018 - starts the server
+        servers = set(psutil.Process().children(recursive=True)) - before
+        marks, incidents = graded(bench, heal(mean=slow))
+    assert killers and points(marks) == [4.0, 6.0, 5.0] and incidents == []
+
+
+def kill(process: psutil.Process) -> None:
+    with contextlib.suppress(psutil.NoSuchProcess):
+        process.kill()
 
 
 def test_a_syntax_error_costs_its_own_exercise_only(bench: Bench, heal: Any) -> None:

@@ -27,6 +27,7 @@ from robotbrain.grading.tester_link import TesterProcess
 
 STUDENT_PROCESS_TAG = "student-process"  # a graded cell that must see the student's process, e.g. its plots
 _SHORTEST_S = 0.1
+_LOST = "the student's process was ended from outside"
 
 
 class Lost(Exception):  # noqa: N818 - what happened
@@ -109,6 +110,7 @@ class Executor:
                     start_tester=self._start_tester,
                     fresh=self._fresh,
                     memory_kills=lambda: self._process.out_of_memory() if self._process is not None else 0,
+                    look=self._look,
                     limits=self._limits,
                     incidents=self._state.incidents,
                 ).run()
@@ -196,7 +198,7 @@ class Executor:
                 output.execution_count = number
         if end is CellEnd.DIED:
             if not process.fell():
-                raise Lost("the student's process was ended from outside")
+                raise Lost(_LOST)
             if process.out_of_memory() > before:
                 self._state.incidents.append(f"{label(cell, index)}: this cell used up the memory")
         if end is CellEnd.INTERRUPTED:
@@ -204,6 +206,11 @@ class Executor:
             cell.outputs.insert(0, outputs.stream(f"This cell {note}.\n"))
             self._state.incidents.append(f"{label(cell, index)}: this cell {note}")
         return end
+
+    def _look(self) -> None:
+        """Raise if the student's processes were ended from outside."""
+        if self._process is not None and self._process.taken_away():
+            raise Lost(_LOST)
 
     def _blame(self, index: int, end: CellEnd) -> None:
         """Leave out, from now on, the cell that ended the process."""

@@ -96,6 +96,7 @@ class Scorer:
         start_tester: makes a tester.
         fresh: makes a copy of the student's process as the notebook left it; None if that is not possible any more.
         memory_kills: how many of the student's processes have run out of memory so far.
+        look: called when a snapshot has ended; raises if it was the machine that ended the student's processes.
         limits: of this run.
         incidents: what goes wrong is added here, in words.
     """
@@ -107,11 +108,13 @@ class Scorer:
         start_tester: Callable[[], TesterProcess],
         fresh: Callable[[], Snapshot | None],
         memory_kills: Callable[[], int],
+        look: Callable[[], None],
         limits: Limits,
         incidents: list[str],
     ) -> None:
         self._graded, self._start, self._fresh = graded, start_tester, fresh
-        self._memory_kills, self._limits, self._incidents = memory_kills, limits, incidents
+        self._memory_kills, self._look = memory_kills, look
+        self._limits, self._incidents = limits, incidents
         self._tester: TesterProcess | None = None
         self._deaths: dict[int, int] = {}
         self._numbers = itertools.count()
@@ -181,7 +184,10 @@ class Scorer:
 
     def _connect(self, graded: Graded) -> int | None:
         """The number by which the tester knows the cell's snapshot; it is introduced if need be."""
-        if graded.snapshot is None or not graded.snapshot.alive():
+        if graded.snapshot is not None and not graded.snapshot.alive():
+            self._look()
+            graded.snapshot = None
+        if graded.snapshot is None:
             graded.snapshot = self._fresh()
         if graded.snapshot is None:
             self._fail(graded, "KernelEnded", "the Python process ended, and could not be started again")
@@ -206,6 +212,8 @@ class Scorer:
             why = _CRASHED
         else:
             by_itself = graded.snapshot.ends_within(_ENDING_S)
+            if by_itself and not clock.killed:
+                self._look()
             why = _TIMEOUT if clock.killed else _CRASHED if by_itself else _DISTURBED
             graded.snapshot.kill()
             graded.snapshot.close()

@@ -28,6 +28,7 @@ from robotbrain.grading.sandbox.snapshots import Served, Snapshot
 _READY_S = 60.0
 _ANSWER_S = 10.0
 _GONE_S = 5.0
+_SOON_S = 0.2
 _SLACK_BYTES = 64 << 10
 _FORKED = "forked"
 
@@ -215,14 +216,21 @@ class StudentProcess:
 
     def fell(self) -> bool:
         """Whether it is the process's own doing that it no longer answers: then its monitor lives to say so."""
-        if self._alone or self._broke_rules:
+        if self._alone or self._broke_rules or self.exit_code is not None:
             return True
         with contextlib.suppress(OSError, ValueError):
-            for fact in self._tell(_GONE_S):
-                if "exit" in fact:
-                    self.exit_code = int(fact["exit"])
-                    return True
-        return self.alive()  # it closed the line, and goes on
+            for _ in self._tell(_GONE_S):
+                if self.exit_code is not None:
+                    break
+        if self.exit_code is not None:
+            return True
+        # A monitor that lives while the student's process does: that one closed the line, and goes on. A monitor that
+        # is being killed has closed its own line a little before it counts as ended.
+        return not self.ends_within(_GONE_S)
+
+    def taken_away(self) -> bool:
+        """Whether its monitor has ended without a word, or does so at once: no doing of the process."""
+        return self.ends_within(_SOON_S) and not self.fell()
 
     def out_of_memory(self) -> int:
         """How many of its processes the kernel has killed for want of memory."""
@@ -309,7 +317,10 @@ class StudentProcess:
                 return
             *lines, self._facts = (self._facts + chunk).split(b"\n")
             for line in lines:
-                yield json.loads(line)
+                fact = json.loads(line)
+                if "exit" in fact:
+                    self.exit_code = int(fact["exit"])
+                yield fact
 
     def _copy(self, number: object) -> Process:
         """The snapshot that calls itself ``number`` in its own pid namespace.
