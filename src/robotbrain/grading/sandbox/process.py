@@ -219,11 +219,9 @@ class StudentProcess:
         if self._alone or self._broke_rules or self.exit_code is not None:
             return True
         with contextlib.suppress(OSError, ValueError):
-            for _ in self._tell(_GONE_S):
-                if self.exit_code is not None:
-                    break
-        if self.exit_code is not None:
-            return True
+            for fact in self._tell(_GONE_S):
+                if "exit" in fact:
+                    return True
         # A monitor that lives while the student's process does: that one closed the line, and goes on. A monitor that
         # is being killed has closed its own line a little before it counts as ended.
         return not self.ends_within(_GONE_S)
