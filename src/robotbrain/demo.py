@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import html
-import os
 import sys
 import time
 from collections.abc import Sequence
@@ -37,7 +36,7 @@ _KINDS = {"reference": "reference", "style": "right, in another style", "mutant"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``robotbrain demo``."""
     parser.add_argument("--out", type=Path, help="folder for the page (default: demo/ in the course folder)")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="submissions graded at the same time")
+    parser.add_argument("--jobs", type=int, help="submissions graded at the same time (default: one per core)")
     parser.add_argument("--fresh", action="store_true", help="grade everything again, also what has not changed")
 
 
@@ -45,11 +44,12 @@ def main(arguments: argparse.Namespace) -> int:
     """Run the demo; 1 if a submission was not graded as it should be or a drive failed."""
     from robotbrain.grading import mutation
     from robotbrain.grading.course import find_course
+    from robotbrain.grading.scheduler import fitting_workers
 
     began = time.perf_counter()
     course = find_course(None)
     out: Path = (arguments.out or course.home / "demo").resolve()
-    result, manifest = _grade(course, out, arguments.jobs, arguments.fresh)
+    result, manifest = _grade(course, out, arguments.jobs or fitting_workers(), arguments.fresh)
     verdicts = mutation.judge(result.to_dict(), manifest)
     print(mutation.table(verdicts))
     runs = _drive()

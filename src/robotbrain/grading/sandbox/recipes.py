@@ -30,6 +30,7 @@ COMMON = (
     "scipy.ndimage",
     "tqdm.auto",
 )
+_OFTEN = ("torch", "scipy.stats")  # slow to import; who computes with numpy may reach for them, whatever the lab uses
 _ALWAYS = ("IPython", "psutil", "robotbrain.grading", "robotbrain.grading.remote.serve")
 _STUDENT_ENTRY = "robotbrain.grading.sandbox.child:main"
 _STUDENT_ALONE = "robotbrain.grading.sandbox.child:main_alone"
@@ -48,6 +49,8 @@ def student(autograder: Path, labs: Sequence[str], preload: Sequence[str] | None
     """
     if preload is None:
         preload = imports_of(autograder, labs) if labs else COMMON
+        if "numpy" in preload:
+            preload = [*preload, *_OFTEN]
     bwrap = bubblewrap.program()
     wrapper: list[str] = []
     if bwrap is not None:

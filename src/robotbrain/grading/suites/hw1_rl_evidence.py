@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from scipy.stats import beta, norm
 
 from robotbrain.grading import expect, expect_close, fail
 
@@ -67,8 +68,6 @@ def compare_verdicts(answer: Any, key: Mapping[str, str]) -> None:
 
 def exact_bound(successes: int, n: int, doubt: float = 0.05) -> float:
     """Return the lower end of the one-sided Clopper-Pearson interval (1934) of a success rate."""
-    from scipy.stats import beta
-
     return float(beta.ppf(doubt, successes, n - successes + 1)) if successes > 0 else 0.0
 
 
@@ -99,8 +98,6 @@ def as_number(answer: Any) -> float:
 
 def compare_bound(student: Any, cases: Sequence[tuple[int, int]]) -> None:
     """Compare with the exact bound."""
-    from scipy.stats import beta, norm
-
     for k, n in cases:
         expected = exact_bound(k, n)
         answer = student(k, n)

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy import stats
 from torch import Tensor, nn
 
 from robotbrain.grading import expect, expect_close, fail
@@ -381,8 +382,6 @@ def compare_noise(student: Any, rng: np.random.Generator, times: int = 40) -> No
 
     False alarms: mean, spread and Kolmogorov-Smirnov distance, each at a third of ``tools.FALSE_ALARM``.
     """
-    from scipy import stats
-
     std = float(rng.uniform(0.09, 0.11))
     obs = rng.uniform(-0.3, 0.3, (60, OBS)).astype(np.float32)
     found = actions(student, obs, times, int(rng.integers(2**31)), std=std) - obs[:, :ACT]
@@ -410,8 +409,6 @@ def compare_noise(student: Any, rng: np.random.Generator, times: int = 40) -> No
 
 def compare_independent(student: Any, rng: np.random.Generator, times: int = 60) -> None:
     """Each robot, each joint and each call draws for itself."""
-    from scipy import stats
-
     obs = np.zeros((24, OBS), dtype=np.float32)
     found = actions(student, obs, times, int(rng.integers(2**31)), std=0.1)
     expect(not np.all(found == found[:1]), "every call adds the same noise", hint="fresh-noise")

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy import stats
 from torch import Tensor
 
 from robotbrain.grading import expect, expect_close, fail
@@ -165,8 +166,6 @@ def compare_uniform(
     Chi-square over transitions (an upper bound only: drawing without replacement is more even than chance, and as
     good), and the spread of the batches' mean age, which neighbouring rows make larger.
     """
-    from scipy import stats
-
     sizes = [8] * ((capacity + capacity // 2) // 8) + [3]
     known = Transitions(rng, sum(sizes))
     _, fields = student.run(probes.drawn, capacity, known.blocks(sizes), size, times, seed=int(rng.integers(2**31)))

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy import stats
 
 from robotbrain.errors import InputError
 from robotbrain.grading import expect, fail
@@ -306,8 +307,6 @@ def warm_students() -> None:
 
 def warm() -> None:
     """Import, compile and cache what judging needs."""
-    from scipy import stats
-
     from robotbrain.rl.onnx_policy import OnnxPolicy  # noqa: F401
     from robotbrain.rl.surrogate import SurrogateReachEnv, neutral
 

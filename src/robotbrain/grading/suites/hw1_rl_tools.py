@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.linalg import solve_discrete_are
 from torch import Tensor
 
 from robotbrain.grading import expect, fail
@@ -84,8 +85,6 @@ class LinearQuadratic:
     @cached_property
     def cost_to_go(self) -> Array:
         """P: the optimal value of x is ``-x' P x``."""
-        from scipy.linalg import solve_discrete_are
-
         root = np.sqrt(self.gamma)
         return np.asarray(solve_discrete_are(root * self.a, root * self.b, self.s, self.r))
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from robotbrain.grading import expect, fail
 from robotbrain.grading.suites import judging
@@ -250,8 +251,6 @@ def _compare_interval(answer: Any, k: int, n: int, given: str) -> None:
 @functools.cache
 def student_t(n: int) -> float:
     """Return the 97.5 % quantile of Student's t for n pairs."""
-    from scipy import stats
-
     return float(stats.t.ppf(0.975, n - 1))
 
 
@@ -268,8 +267,6 @@ def compare_gap(student: Student, simulated: Sequence[float], surrogate: Sequenc
     answer = student.paired_gap([float(v) for v in a], [float(v) for v in b])
 
     def mistakes() -> list[tuple[str, tuple[float, float, float]]]:
-        from scipy import stats
-
         welch = stats.ttest_ind(b, a, equal_var=False).confidence_interval(0.95)
         pooled = stats.ttest_ind(b, a).confidence_interval(0.95)
         return [
