@@ -127,7 +127,7 @@ def compare_constant(student: Any, rng: np.random.Generator) -> None:
         misconception="the loss should pull Q(s, a) towards the target, not the target towards Q(s, a)",
     )
     expect(found["learnable"] == [[True] * 4] * 2, "td_target switched requires_grad of a network off for good",
-           hint="leave-networks-as-found")  # fmt: skip
+           hint="leave-networks-as-found", expected="requires_grad as it was before the call")  # fmt: skip
 
 
 def compare_fixed_point(student: Any, rng: np.random.Generator) -> None:
@@ -213,11 +213,16 @@ def _compare_gradients(found: Any, expected: Sequence[Tensor], whose: str, hint:
         f"{whose}'s loss is cut off from the network: nothing can be learned from it",
         hint=hint,
         misconception="somewhere between the network and the loss stands detach(), no_grad(), item() or numpy()",
+        expected="a loss with a gradient",
     )
     got = [torch.zeros_like(e) if g is None else g for g, e in zip(found, expected, strict=True)]
     parts = [tools.as_tensor(g, f"{whose}'s gradient", tuple(e.shape)) for g, e in zip(got, expected, strict=True)]
     if hint == "through-the-action" and all(map(close, parts, [-e for e in expected])):
-        fail("the gradient points the wrong way: the actor would learn to be bad", hint="climb-not-descend")
+        fail(
+            "the gradient points the wrong way: the actor would learn to be bad",
+            hint="climb-not-descend",
+            expected="a step that raises the value of the action",
+        )
     for part, wanted in zip(parts, expected, strict=True):
         expect_close(part.numpy(), wanted.numpy(), rtol=1e-3, atol=1e-5, what=f"{whose}'s gradient", hint=hint)
 
@@ -277,7 +282,12 @@ def compare_critic_alone(student: Any, rng: np.random.Generator) -> None:
     gradients = found["gradients"]
     tools.as_tensor(found["loss"], "the actor's loss", ())
     alive = gradients is not None and any(g is not None and bool(g.abs().max() > 0) for g in gradients)
-    expect(alive, "no gradient reaches the actor", hint="through-the-action")
+    expect(
+        alive,
+        "no gradient reaches the actor",
+        hint="through-the-action",
+        expected="a gradient that flows through the action into the actor",
+    )
     for parameter, got in zip(critic.parameters(), found["critic"], strict=True):
         expect(
             got is not None and torch.equal(got, torch.full_like(parameter, marker)),
@@ -337,7 +347,7 @@ def compare_separate(student: Any, rng: np.random.Generator) -> None:
         given = f"tau = {tau:g}"
         expect(torch.equal(flat(found["target"]), flat(found["later"])),
                "when the online network learned on, the target changed with it", given=given,
-               hint="in-place")  # fmt: skip
+               hint="in-place", expected="a target that only soft_update changes")  # fmt: skip
         expect_close(flat(found["later"]).numpy(), (old + tau * (new - old)).numpy(), rtol=1e-4, atol=1e-6, given=given,
                      what="the target's parameters", hint="target-follows")  # fmt: skip
 
@@ -357,7 +367,12 @@ def actions(student: Any, obs: Any, times: int, seed: int, actor: probes.Fixed |
     if not isinstance(found, np.ndarray):
         answer = found[0]
         if not isinstance(answer, np.ndarray):
-            fail("actions should be a NumPy array, for the environment", got=answer, hint="numpy-for-the-env")
+            fail(
+                "actions should be a NumPy array, for the environment",
+                got=answer,
+                hint="numpy-for-the-env",
+                expected="numpy.ndarray",
+            )
         fail("actions have different shapes in different calls", got=answer.shape, expected=shape,
              hint="numpy-for-the-env")  # fmt: skip
     expect(found.shape[1:] == shape and len(found) == times, "actions have the wrong shape", got=found.shape[1:],
@@ -387,7 +402,9 @@ def compare_noise(student: Any, rng: np.random.Generator, times: int = 40) -> No
     found = actions(student, obs, times, int(rng.integers(2**31)), std=std) - obs[:, :ACT]
     given = f"std = {std:g}, {found.size} numbers, far from the bounds"
     if np.all(found == 0):
-        fail("there is no noise", given=given, hint="noise-to-explore")
+        fail(
+            "there is no noise", given=given, hint="noise-to-explore", expected="noise of the given standard deviation"
+        )
     for axis in (1, 2):  # noise that robots or joints share is another test's business
         first = np.take(found, [0], axis=axis)
         found = first if np.allclose(found, first, atol=1e-5) else found
@@ -404,21 +421,36 @@ def compare_noise(student: Any, rng: np.random.Generator, times: int = 40) -> No
            expected=0.0, given=given, hint="gaussian-noise")  # fmt: skip
     fit = stats.kstest(found.ravel() / std, "norm", method="asymp")
     expect(fit.pvalue > alarm, "the noise is not Gaussian", given=given, got=f"{fit.statistic:.3f} from the bell",
-           hint="gaussian-noise")  # fmt: skip
+           hint="gaussian-noise", expected="a bell curve")  # fmt: skip
 
 
 def compare_independent(student: Any, rng: np.random.Generator, times: int = 60) -> None:
     """Each robot, each joint and each call draws for itself."""
     obs = np.zeros((24, OBS), dtype=np.float32)
     found = actions(student, obs, times, int(rng.integers(2**31)), std=0.1)
-    expect(not np.all(found == found[:1]), "every call adds the same noise", hint="fresh-noise")
-    expect(not np.allclose(found, found[:, :1]), "all robots get the same noise", hint="fresh-noise")
-    expect(not np.allclose(found, found[..., :1]), "all joints get the same noise", hint="fresh-noise")
+    expect(
+        not np.all(found == found[:1]),
+        "every call adds the same noise",
+        hint="fresh-noise",
+        expected="new noise at every call",
+    )
+    expect(
+        not np.allclose(found, found[:, :1]),
+        "all robots get the same noise",
+        hint="fresh-noise",
+        expected="noise of its own for every robot",
+    )
+    expect(
+        not np.allclose(found, found[..., :1]),
+        "all joints get the same noise",
+        hint="fresh-noise",
+        expected="noise of its own for every joint",
+    )
     table = found.reshape(times, -1)
     steps = np.corrcoef(table[:-1].ravel(), table[1:].ravel())[0, 1]
     limit = stats.norm.isf(tools.FALSE_ALARM / 2) / table[1:].size ** 0.5
     expect(abs(steps) < limit, "the noise of one call depends on that of the call before", got=round(float(steps), 3),
-           hint="fresh-noise")  # fmt: skip
+           hint="fresh-noise", expected="about 0: noise that remembers nothing")  # fmt: skip
 
 
 def compare_bounds(student: Any, rng: np.random.Generator) -> None:
@@ -515,7 +547,12 @@ def compare_agent_acts(student: Any, rng: np.random.Generator) -> None:
     if not isinstance(noisy, np.ndarray) or noisy.shape != clean.shape:
         fail("act(obs, explore=True) should return actions", got=noisy, expected=f"an array {clean.shape}")
     spread = float((noisy.astype(float) - clean).std())
-    expect(spread > 1e-6, "act(obs, explore=True) adds no noise", hint="noise-to-explore")
+    expect(
+        spread > 1e-6,
+        "act(obs, explore=True) adds no noise",
+        hint="noise-to-explore",
+        expected="actions with noise around those without",
+    )
     # 400 Gaussian numbers: their standard deviation is within 25 % but for a probability of about 1e-12.
     near = 0.75 < spread / RATES["noise_std"] < 1.25
     expect(near, "act(obs, explore=True) adds noise of another size than noise_std",
@@ -530,10 +567,10 @@ def compare_targets_wait(student: Any, rng: np.random.Generator) -> None:
         start = flat(probes.values_of(network))
         for which in (name, f"{name}_target"):
             expect(close(flat(found[which]), start), f"{which} does not begin as a copy of the {name} that was given",
-                   hint="targets-are-copies")  # fmt: skip
+                   hint="targets-are-copies", expected=f"the same parameters as {name}")  # fmt: skip
         expect(close(flat(found[f"{name}_target later"]), start),
                f"{name}_target is {name} itself: the target moves with every step of the optimiser",
-               hint="targets-are-copies")  # fmt: skip
+               hint="targets-are-copies", expected="a copy with parameters of its own")  # fmt: skip
 
 
 def compare_learns(student: Any, rng: np.random.Generator, updates: int = 60) -> None:

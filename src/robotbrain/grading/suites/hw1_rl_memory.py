@@ -89,7 +89,7 @@ def rows(fields: Any, known: Transitions, size: int, unwritten: str = "not-yet-f
     flat = [field.numpy().reshape(-1, *field.shape[2 if several else 1 :]) for field in fields]
     found = {name: known.numbers(k, flat[k]) for k, name in enumerate(FIELDS[:4])}
     if any(np.any(numbers == UNWRITTEN) for numbers in found.values()):
-        fail("rows came back that were never stored", hint=unwritten, got=flat[0][:4])
+        fail("rows came back that were never stored", hint=unwritten, got=flat[0][:4], expected="rows that were stored")
     owner = found["obs"]
     hints = {"reward": "reward-of-this-step", "next_obs": "next-obs-of-this-step"}
     for name, numbers in found.items():
@@ -102,6 +102,7 @@ def rows(fields: Any, known: Transitions, size: int, unwritten: str = "not-yet-f
                 given="transitions of random numbers",
                 got=f"obs of transition {owner[row]}; {name} is {whose}",
                 hint=hints.get(name, "rows-stay-together"),
+                expected=f"{name} of the same transition, {owner[row]}",
             )
     flags, truth = flat[4], known.fields[4][owner]
     if np.array_equal(flags, 1 - truth):
@@ -171,11 +172,12 @@ def compare_uniform(
     _, fields = student.run(probes.drawn, capacity, known.blocks(sizes), size, times, seed=int(rng.integers(2**31)))
     found = rows(fields, known, size) - (sum(sizes) - capacity)
     expect(found.min() >= 0, "the buffer does not hold the newest transitions", hint="oldest-goes",
-           got=f"one of {-int(found.min())} transitions before the oldest that should be there")  # fmt: skip
+           got=f"one of {-int(found.min())} transitions before the oldest that should be there",
+           expected="the newest, as many as fit")  # fmt: skip
     counts = np.bincount(found.ravel(), minlength=capacity)
     given = f"{times} batches of {size} from {capacity} transitions"
     if np.all(np.sort(found, axis=1) == np.sort(found[:1], axis=1)):
-        fail("every batch is the same", given=given, hint="fresh-draws")
+        fail("every batch is the same", given=given, hint="fresh-draws", expected="a new draw each time")
     spread = float(found.mean(axis=1).var() / (found.var() / size))
     limit = 1 + stats.norm.isf(tools.FALSE_ALARM) * np.sqrt(2 / (times - 1))
     expect(spread < limit, "the rows of a batch are not drawn independently", given=given,
@@ -200,22 +202,23 @@ def compare_copies(student: Any, rng: np.random.Generator) -> None:
     found = student.run(probes.overwritten, 16, known.block(0, 8), known.block(8, 16), 8, seed=int(rng.integers(2**31)))
     written, before, after, returned = (list(found[key]) for key in ("written", "before", "after", "returned"))
     sizes = [len(part) for part in (written, before, after, returned)]
-    expect(sizes == [4, 4, 4, 8], "batches are missing", got=sizes)
+    expect(sizes == [4, 4, 4, 8], "batches are missing", got=sizes, expected=[4, 4, 4, 8])
     for batch in written:
         _check_form(batch, 8)
         expect(not any(bool((part == -7).any()) for part in batch),
                "what was stored changed when the caller wrote into its own array after add", hint="keep-a-copy",
-               given="obs, then overwritten by the environment's next step")  # fmt: skip
+               given="obs, then overwritten by the environment's next step",
+               expected="what was stored, unchanged")  # fmt: skip
         rows(batch, known, 8)
     for then, now in zip(before, after, strict=True):
         rows(then, known, 8)
         same = all(torch.equal(old, new) for old, new in zip(then, now, strict=True))
         expect(same, "a batch drawn earlier changed later on", given="16 more transitions, and another batch",
-               hint="batch-is-a-copy")  # fmt: skip
+               hint="batch-is-a-copy", expected="the batch as it was drawn")  # fmt: skip
     for batch in returned:
         _check_form(batch, 8)
         expect(not any(bool((part == -7).any()) for part in batch), "writing into a batch changed what is stored",
-               hint="batch-is-a-copy")  # fmt: skip
+               hint="batch-is-a-copy", expected="what was stored, unchanged")  # fmt: skip
 
 
 # ---------------------------------------------------------------- what to store
@@ -249,7 +252,13 @@ def compare_store(student: Any, steps: Sequence[dict[str, Any]], given: str) -> 
 
 
 def _compare_stored(step: dict[str, Any], calls: Any, given: str) -> None:
-    expect(len(calls) == 1, "store_step should call buffer.add once", got=f"{len(calls)} calls", given=given)
+    expect(
+        len(calls) == 1,
+        "store_step should call buffer.add once",
+        got=f"{len(calls)} calls",
+        given=given,
+        expected="1 call",
+    )
     obs, action, reward, next_obs, terminated = calls[0]
     expected = step["next_obs"].astype(float)
     if step["info"]:
@@ -274,4 +283,5 @@ def compare_untouched(student: Any, step: dict[str, Any]) -> None:
     for name in probes.STEP:
         expect(np.array_equal(step[name], found["after"][name]),
                f"{name} was changed in place; the training loop still needs it",
-               given="an environment that has just begun a new episode", hint="leave-next-obs")  # fmt: skip
+               given="an environment that has just begun a new episode", hint="leave-next-obs",
+               expected=f"{name} as it was before")  # fmt: skip

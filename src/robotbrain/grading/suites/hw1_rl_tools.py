@@ -51,7 +51,12 @@ def as_tensor(
         hint = next((key for wrong, key in hints if tuple(answer.shape) == wrong), "shape-of-a-batch")
         fail(f"{what} has shape {tuple(answer.shape)}, but shape {shape} is expected", got=tuple(answer.shape),
              expected=shape, hint=hint)  # fmt: skip
-    expect(answer.dtype.is_floating_point, f"{what} should hold floating-point numbers", got=str(answer.dtype))
+    expect(
+        answer.dtype.is_floating_point,
+        f"{what} should hold floating-point numbers",
+        got=str(answer.dtype),
+        expected="torch.float32",
+    )
     tensor: Tensor = answer.detach()
     return tensor
 

@@ -140,7 +140,11 @@ def preprocess_dtype(student: Student) -> None:
     # Scaled somehow and put in any order, but the image's values: the other tests judge the rest.
     numbers = judging.as_numbers(answer)
     same = numbers is not None and numbers.size == pixels.size and np.ptp(numbers) > 0
-    expect(same and np.allclose(_spread(numbers), _spread(pixels), atol=1e-3), "these are not the image's 90 values")
+    expect(
+        same and np.allclose(_spread(numbers), _spread(pixels), atol=1e-3),
+        "these are not the image's 90 values",
+        expected="the image's own values, each once, brought to the network's range",
+    )
 
 
 def _spread(values: Any) -> Any:
@@ -178,7 +182,9 @@ def back_project_nan(student: Student) -> None:
     points = tools.points_of(student, depth, tools.camera(pitch=0.2))
     gone = points[row, column]
     expect(np.isnan(gone).all(), "a pixel without depth should be NaN", got=gone, expected="three NaN")
-    expect(np.isfinite(points).sum() == 72, "pixels with a depth should be finite", got=points)
+    expect(
+        np.isfinite(points).sum() == 72, "pixels with a depth should be finite", got=points, expected="72 finite rows"
+    )
 
 
 @suite.test("deadline", points=2, name="a period of 100 ms", reread="Exercise 1.3")
@@ -303,7 +309,7 @@ def tracker_patience(student: Student) -> None:
         goal = tracker.goal()
         expect(goal is None, f"a goal {count}", got=goal, expected="None")
         tracker.add_sighting(0, (1.0, 0.0))
-    expect(tracker.goal() is not None, "no goal after three sightings", got="None")
+    expect(tracker.goal() is not None, "no goal after three sightings", got="None", expected="a point (x, y)")
 
 
 @suite.test("planner_node", points=3, name="answers with a path around a wall", reread="Exercise 3.2", time_limit_s=20)
@@ -329,7 +335,12 @@ def planner_without_map(student: Student) -> None:
     expect(len(points) == 0, "a path without a map", got=points, expected="an empty path")
     # A node that never answers with a path has not understood the question.
     bench.show(open_room())
-    expect(len(bench.ask((0.0, 0.0), (1.0, 0.0))) > 0, "no path with a map either", got="an empty path")
+    expect(
+        len(bench.ask((0.0, 0.0), (1.0, 0.0))) > 0,
+        "no path with a map either",
+        got="an empty path",
+        expected="a path: there is a map now",
+    )
 
 
 # ---------------------------------------------------------------- Parts 4 and 5

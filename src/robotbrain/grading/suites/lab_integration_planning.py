@@ -33,7 +33,9 @@ def untouched(student: Student, name: str, array: NDArray[Any], *arguments: Any,
     answer = student[name](held, *arguments, **options)
     after = judging.as_numbers(student.fetch(held))
     same = after is not None and np.array_equal(after, array, equal_nan=True)
-    expect(same, "the function changed the array it was given", hint="leave-inputs-alone")
+    expect(
+        same, "the function changed the array it was given", hint="leave-inputs-alone", expected="the array as it was"
+    )
     return answer
 
 
@@ -152,17 +154,33 @@ def checked_path(answer: Any, cost: Array, start: Cell, goal: Cell) -> Path:
     if path is None:
         fail("the path is not a list of (row, column) pairs", got=answer, expected="[(row, column), ...]")
     assert path is not None
-    expect(len(path) > 0, "the path is empty", got=path)
+    expect(len(path) > 0, "the path is empty", got=path, expected="a list of cells")
     ends = path[0] == tuple(start) and path[-1] == tuple(goal)
     expect(ends, "the path's ends are wrong", got=(path[0], path[-1]), expected=(start, goal), hint="path-ends")
     for a, b in itertools.pairwise(path):
         step = max(abs(a[0] - b[0]), abs(a[1] - b[1]))
-        expect(step == 1, "two cells of the path are no neighbours", got=(a, b))
+        expect(
+            step == 1,
+            "two cells of the path are no neighbours",
+            got=(a, b),
+            expected="a step to one of the eight cells around",
+        )
         inside = 0 <= b[0] < cost.shape[0] and 0 <= b[1] < cost.shape[1]
-        expect(inside and np.isfinite(cost[b]), "the path enters a lethal cell", got=b)
+        expect(
+            inside and np.isfinite(cost[b]),
+            "the path enters a lethal cell",
+            got=b,
+            expected="a cell on the map that is not lethal",
+        )
         if a[0] != b[0] and a[1] != b[1]:
             free = np.isfinite(cost[a[0], b[1]]) and np.isfinite(cost[b[0], a[1]])
-            expect(free, "the path cuts a corner", got=(a, b), hint="corner-cutting")
+            expect(
+                free,
+                "the path cuts a corner",
+                got=(a, b),
+                hint="corner-cutting",
+                expected="a diagonal step only where both cells beside it are free",
+            )
     return path
 
 
@@ -263,7 +281,13 @@ def smoothed(student: Student, path: Path, cost: Array, **options: float) -> Pat
         fail("the answer is not a list of (row, column) pairs", got=answer, expected="cells of the path")
     assert kept is not None
     remaining = iter(path)
-    expect(all(cell in remaining for cell in kept), "the kept cells are no sub-list of the path", got=kept, given=path)
+    expect(
+        all(cell in remaining for cell in kept),
+        "the kept cells are no sub-list of the path",
+        got=kept,
+        given=path,
+        expected="cells of the path, in its order",
+    )
     ends = len(kept) > 0 and kept[0] == path[0] and kept[-1] == path[-1]
     expect(ends, "the ends must be kept", got=kept, expected=f"first {path[0]}, last {path[-1]}", hint="path-ends")
     return kept
@@ -284,7 +308,13 @@ def check_smoothed(
         first, last = index[a], index[b]
         if last - first > 1:
             price, stretch = detour.segment(first, last), detour.stretch(first, last)
-            expect(np.isfinite(price), "a segment crosses a lethal cell", got=(a, b), hint="lethal-shortcut")
+            expect(
+                np.isfinite(price),
+                "a segment crosses a lethal cell",
+                got=(a, b),
+                hint="lethal-shortcut",
+                expected="segments through cells that are not lethal",
+            )
             expect(
                 price <= slack * stretch + 1e-6,
                 "a segment is much dearer than the stretch it replaces",
@@ -304,18 +334,49 @@ def compare_plan(bench: PlannerBench, room: Room, start: Point, goal: Point, tol
     """Check that the answered path starts at the start, ends at the goal and stays off the obstacles; return it."""
     points = bench.ask(start, goal, tolerance)
     given = f"start {start}, goal {goal} in a walled room"
-    expect(len(points) > 1, "the path is empty, but there is a route", got=f"{len(points)} poses", given=given)
+    expect(
+        len(points) > 1,
+        "the path is empty, but there is a route",
+        got=f"{len(points)} poses",
+        given=given,
+        expected="at least 2 poses",
+    )
     occupancy, resolution, origin = room
     mirrored = (points - np.asarray(origin))[:, ::-1] + np.asarray(origin)
     lost = np.hypot(*(points[0] - start)) > 0.4 and np.hypot(*(mirrored[0] - start)) < 0.4
     hint = "row-is-y" if lost else ""
-    expect(np.hypot(*(points[0] - start)) < 0.6, "the path does not begin at the start", got=points[0], hint=hint)
+    expect(
+        np.hypot(*(points[0] - start)) < 0.6,
+        "the path does not begin at the start",
+        got=points[0],
+        hint=hint,
+        expected=f"within 0.6 m of {start}",
+    )
     reach = tolerance + 1.5 * resolution
-    expect(np.hypot(*(points[-1] - goal)) < reach, "the path does not end at the goal", got=points[-1], hint=hint)
+    expect(
+        np.hypot(*(points[-1] - goal)) < reach,
+        "the path does not end at the goal",
+        got=points[-1],
+        hint=hint,
+        expected=f"within {reach:g} m of {goal}",
+    )
     dense = planning.resample(points, resolution / 2)
     cells = np.floor((dense - np.asarray(origin)) / resolution).astype(int)[:, ::-1]
     inside = ((cells >= 0) & (cells < occupancy.shape)).all(axis=1)
-    expect(inside.all(), "the path leaves the map", got=dense[~inside][:1], hint="row-is-y")
+    expect(
+        inside.all(),
+        "the path leaves the map",
+        got=dense[~inside][:1],
+        hint="row-is-y",
+        expected="points within the map",
+    )
     hits = occupancy[cells[:, 0], cells[:, 1]] >= 65
-    expect(not hits.any(), "the path goes through an obstacle", got=dense[hits][:1], given=given, hint=hint)
+    expect(
+        not hits.any(),
+        "the path goes through an obstacle",
+        got=dense[hits][:1],
+        given=given,
+        hint=hint,
+        expected="a path through free cells only",
+    )
     return points

@@ -84,7 +84,12 @@ class PlannerBench:
         self._host = hosted
         self.work: dict[str, float] = {}
         self.most_work: dict[str, float] = {}
-        expect(self._host.ready() is True, "the node offers no service called `plan`", hint="return-response")
+        expect(
+            self._host.ready() is True,
+            "the node offers no service called `plan`",
+            hint="return-response",
+            expected="a service `plan`, of type GetPlan",
+        )
 
     @classmethod
     def of(cls, student: Student, name: str) -> PlannerBench:
@@ -99,13 +104,18 @@ class PlannerBench:
     def ask(self, start: Point, goal: Point, tolerance: float = 0.3) -> Array:
         """Return the answered path, (N, 2) m."""
         path, work = _call(lambda: self._host.ask(tuple(start), tuple(goal), tolerance))
-        expect(path is not None, "the service did not answer", hint="return-response")
+        expect(
+            path is not None,
+            "the service did not answer",
+            hint="return-response",
+            expected="the response, with its plan filled in",
+        )
         self.work = {str(kind): float(units) for kind, units in work.items()}
         for kind, units in self.work.items():
             self.most_work[kind] = max(units, self.most_work.get(kind, 0.0))
         points = as_numbers(path)
         if points is None or points.ndim != 2 or points.shape[1] != 2 or not np.isfinite(points).all():
-            fail("the answered path is no list of finite points", got=path)
+            fail("the answered path is no list of finite points", got=path, expected="finite points (x, y)")
         assert points is not None
         return points
 
@@ -120,7 +130,7 @@ def _call(ask: Callable[[], Any]) -> Any:
         kind, said = getattr(error, "type_name", type(error).__name__), str(error)
         stuck = "empty-when-stuck" if "NoneType" in said else ""
         hint = "return-response" if "must return" in said else stuck
-        fail(f"a callback of the node raised {kind}: {said}", hint=hint)
+        fail(f"a callback of the node raised {kind}: {said}", hint=hint, expected="no exception")
 
 
 def approach(
