@@ -226,6 +226,18 @@ def test_what_a_hidden_test_passes_in_does_not_reach_a_later_report(bench: Bench
     assert "3.0" in str(marks["mean"].tests) and "41.5" not in str(healed.notebook)
 
 
+def test_a_hang_in_a_notebook_with_threads_costs_the_test_that_hangs(bench: Bench, heal: Any) -> None:
+    """There are no copies, so what is killed is the student's process itself: that is no failure of the machine."""
+    threads = "import threading, time\nthreading.Thread(target=time.sleep, args=(60,), daemon=True).start()\n"
+    hang = (
+        "def mean(values):\n    while True:\n        try:\n            time.sleep(1)\n"
+        "        except BaseException:\n            pass"
+    )
+    marks, incidents = graded(bench, heal(scale=threads + toylab.SOLUTIONS["scale"], mean=hang))
+    assert points(marks) == [4.0, 6.0, 0.0]
+    assert "hung" in " ".join(incidents)
+
+
 def test_a_notebook_with_threads_is_graded_without_copies(bench: Bench, heal: Any) -> None:
     threads = "import threading, time\nthreading.Thread(target=time.sleep, args=(60,), daemon=True).start()\n"
     marks, _ = graded(bench, heal(scale=threads + toylab.SOLUTIONS["scale"]))

@@ -218,6 +218,8 @@ class StudentProcess:
         """Whether it is the process's own doing that it no longer answers: then its monitor lives to say so."""
         if self._alone or self._broke_rules or self.exit_code is not None:
             return True
+        if self.out_of_memory():  # the kernel may have picked the monitor, which is in the same group
+            return True
         with contextlib.suppress(OSError, ValueError):
             for fact in self._tell(_GONE_S):
                 if "exit" in fact:
@@ -227,8 +229,8 @@ class StudentProcess:
         return not self.ends_within(_GONE_S)
 
     def taken_away(self) -> bool:
-        """Whether its monitor has ended without a word, or does so at once: no doing of the process."""
-        return self.ends_within(_SOON_S) and not self.fell()
+        """Whether its monitor has ended without a word, or does so at once: no doing of the process, nor of ours."""
+        return self._process is not None and self.ends_within(_SOON_S) and not self.fell()
 
     def out_of_memory(self) -> int:
         """How many of its processes the kernel has killed for want of memory."""

@@ -22,7 +22,7 @@ _HINTS = {
     "no-future-after-an-end": "After a termination there is nothing: last_value counts only where an episode was cut.",
     "a-cut-has-a-future": "The episode was only cut off: add the value of the state in which it was cut.",
     "inner-derivative": "The derivative of exp(-(d/s)^2) is -2 d / s^2 times the same: mind the inner derivative.",
-    "both-parts": "There are two parts: the straight line pulls with 1, and the dip adds its own.",
+    "both-parts": "There are two parts: the straight line pulls with 1, and the peak adds its own.",
     "sign-of-the-pull": "pull is positive: by how much the reward GROWS when d shrinks.",
     "works-for-arrays": "Use np.exp and plain arithmetic, so that d may be an array.",
     "seconds": "Steps times dt are seconds: dt / (1 - gamma).",
