@@ -186,6 +186,7 @@ class Scorer:
         """The number by which the tester knows the cell's snapshot; it is introduced if need be."""
         if graded.snapshot is not None and not graded.snapshot.alive():
             self._look()
+            graded.snapshot.close()
             graded.snapshot = None
         if graded.snapshot is None:
             graded.snapshot = self._fresh()
