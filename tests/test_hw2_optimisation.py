@@ -93,8 +93,8 @@ def test_the_budget_of_the_notebook_is_the_judges(solution: Any) -> None:
     for promise in (
         f"**{judge.BUDGET['latency_ms']:g} ms**",
         f"**{judge.BUDGET['bytes'] / 1000:g} kB**",
-        f"**{100 * judge.BUDGET['drop']:g} points**",
-        f"Up to {100 * judge.HALF_DROP:g} points",
+        f"**{100 * judge.BUDGET['drop']:g} percentage points**",
+        f"A drop of up to {100 * judge.HALF_DROP:g} percentage points",
     ):
         assert promise in text, promise
 

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -21,6 +23,8 @@ def _toy_suite(course_root: Path) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(SUITES_VARIABLE, str(course_root / "suites"))
         patch.setenv(AUTOGRADER_VARIABLE, str(course_root / "autograder"))
+        beside = str(Path(sys.executable).parent)  # nbgrader's gradebook calls `alembic`; no environment is activated
+        patch.setenv("PATH", os.pathsep.join((beside, os.environ.get("PATH", os.defpath))))
         yield
 
 

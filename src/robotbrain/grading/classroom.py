@@ -114,8 +114,10 @@ def grade_class(
 
 @contextlib.contextmanager
 def _settled_heap() -> Iterator[None]:
-    """Spare the garbage collector what is there to stay, above all imported modules: one time in twenty was its."""
-    gc.collect()
+    """Spare the garbage collector what is there to stay, above all imported modules: one second in twenty was its.
+
+    Nothing is collected here: in a forked process that could end thread pools which are not there any more.
+    """
     gc.freeze()
     try:
         yield

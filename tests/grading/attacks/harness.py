@@ -274,8 +274,8 @@ def run_one(arena: Arena, student: str, attack: Attack, bench: jobs.Bench) -> Ou
     return judge(arena, done.notebook, [*healed.repairs, *done.incidents], time.monotonic() - start)
 
 
-def run_all(arena: Arena, attacks: Mapping[str, Attack], bench: jobs.Bench, workers: int = 2) -> dict[str, Outcome]:
-    """Grade many submissions side by side; student -> outcome."""
+def run_all(arena: Arena, attacks: Mapping[str, Attack], bench: jobs.Bench, workers: int = 4) -> dict[str, Outcome]:
+    """Grade many submissions side by side; student -> outcome. Most of them wait for a time limit most of the time."""
     with ThreadPoolExecutor(workers) as pool:
         running = {student: pool.submit(run_one, arena, student, attack, bench) for student, attack in attacks.items()}
         return {student: future.result() for student, future in running.items()}
