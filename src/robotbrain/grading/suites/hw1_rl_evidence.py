@@ -63,7 +63,7 @@ def compare_verdicts(answer: Any, key: Mapping[str, str]) -> None:
         got=f"{first}: {given[first]}",
         hint=_VERDICT_HINTS[first],
         credit=right / len(key),
-        expected="a verdict that follows from the numbers, for each",
+        expected=f"another of {', '.join(words)}",
     )
 
 

@@ -55,7 +55,7 @@ def as_tensor(
         answer.dtype.is_floating_point,
         f"{what} should hold floating-point numbers",
         got=str(answer.dtype),
-        expected="torch.float32",
+        expected="a floating-point dtype, for example torch.float32",
     )
     tensor: Tensor = answer.detach()
     return tensor

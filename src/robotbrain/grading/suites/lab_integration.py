@@ -143,7 +143,7 @@ def preprocess_dtype(student: Student) -> None:
     expect(
         same and np.allclose(_spread(numbers), _spread(pixels), atol=1e-3),
         "these are not the image's 90 values",
-        expected="the image's own values, each once, brought to the network's range",
+        expected="the image's own values, each once, however they are scaled",
     )
 
 
@@ -183,7 +183,10 @@ def back_project_nan(student: Student) -> None:
     gone = points[row, column]
     expect(np.isnan(gone).all(), "a pixel without depth should be NaN", got=gone, expected="three NaN")
     expect(
-        np.isfinite(points).sum() == 72, "pixels with a depth should be finite", got=points, expected="72 finite rows"
+        np.isfinite(points).sum() == 72,
+        "pixels with a depth should be finite",
+        got=points,
+        expected="72 finite numbers",
     )
 
 
