@@ -33,6 +33,7 @@ def copies(*sources: str, files: tuple[str, ...] = ()) -> dict[int, int]:
         "@torch.no_grad()\ndef act(x: np.ndarray = None) -> np.ndarray:\n    x[0] = 1\n    return x",
         "@dataclass(frozen=True)\nclass Pose:\n    x: float = 0.0\n    names: list = field(default_factory=list)",
         "SETTINGS = {'gamma': 0.9, 'layers': (64, 64), 'low': -1}\nHALF: float = 1 / 2",
+        "FILE, SIZE = 'policy.onnx', 64",
         "lab.check('scale')",
         "\n# nothing\n",
         "'''Only words.'''\npass",
@@ -49,6 +50,9 @@ def test_new_definitions_change_nothing_that_was_there(between: str) -> None:
         "def helper(x):\n    return x",  # until here, calling `scale` failed
         "GAIN = 3",
         "GAIN: int = 3",
+        "NEW, GAIN = 1, 3",
+        "NEW, scale.gain = 1, 3",
+        "NEW, *GAIN = 1, 3",
         "import heapq as np",
         "from numpy import abs as GAIN",
         "import cheat",
@@ -82,9 +86,26 @@ def test_in_doubt_there_is_a_copy(between: str) -> None:
     assert copies(FIRST, "#1", between, "#2", files=("cheat.py", "data.csv")) == {1: 1, 3: 3}
 
 
-def test_a_name_that_prose_has_spoken_of_may_be_one_that_tests_look_for() -> None:
-    assert copies("%%textWrite smooth()", "#1", "def smooth(): pass", "#2") == {1: 1, 3: 3}
-    assert copies("#0", "%%textWrite smooth()", "def smooth(): pass", "#3") == {0: 3, 3: 3}
+def test_a_name_that_an_exercise_speaks_of_may_be_one_that_its_tests_look_for() -> None:
+    later = ("#1", "def smooth(): pass", "#2")
+    assert copies("%%textWrite `smooth(path)`", *later) == {1: 1, 3: 3}
+    assert copies("%%text# Exercise 1\n", "%%textWrite ``smooth``", "#2", *later[1:]) == {2: 2, 4: 4}
+    assert copies("#0", "%%textWrite `smooth()`", "def smooth(): pass", "#3") == {0: 3, 3: 3}
+    # A group keeps what all of its exercises speak of, not only the last one.
+    cells = ("%%text# 1\nWrite `smooth`", "#1", "%%text# 2", "def other(): pass", "#4", "def smooth(): pass", "#6")
+    assert copies(*cells) == {1: 4, 4: 4, 6: 6}
+
+
+def test_other_prose_defines_nothing_and_asks_for_nothing() -> None:
+    later = ("#1", "def smooth(): pass", "#2")
+    assert copies("%%textA smooth path", *later) == {1: 3, 3: 3}
+    assert copies("%%textYou will write `smooth`", "%%text# Exercise 1", "#2", *later[1:]) == {2: 4, 4: 4}
+
+
+def test_where_an_import_comes_from_is_no_name() -> None:
+    assert copies("from scipy.special import beta", "#1", "import scipy.stats", "#3") == {1: 3, 3: 3}
+    assert copies("import scipy", "#1", "import scipy.stats", "#3") == {1: 1, 3: 3}
+    assert copies("from scipy.special import beta", "#1", "def beta(): pass", "#3") == {1: 1, 3: 3}
 
 
 def test_only_the_exercises_before_a_change_keep_their_own_copy() -> None:

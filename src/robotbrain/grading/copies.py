@@ -2,7 +2,8 @@
 
 A copy keeps the notebook as it is at a graded cell, and costs about as much as all of an exercise's tests. Cells that
 only define new names change nothing for the exercises before them: these can be tested in the copy of a later one. That
-is decided from the source alone, and in doubt there is a copy. Within one copy the tests of several exercises follow
+is decided from the source alone, and in doubt there is a copy; a name that an exercise's own prose gives in backticks is
+one that its tests may look for. Within one copy the tests of several exercises follow
 one another, as they do in the notebook.
 """
 
@@ -14,6 +15,8 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 _WORD = re.compile(r"\w+")
+_ORIGIN = re.compile(r"^\s*from\s+[\w.]+\s+import\b", re.MULTILINE)  # binds none of the names in it
+_MARKED = re.compile(r"`[^`]+`")  # how prose names what is to be written
 _CHECK = re.compile(r"lab\.check\((['\"])\w+\1\)")
 _HARMLESS = {"dataclass", "field", "no_grad", "inference_mode", "lru_cache", "cache", "wraps", "total_ordering"}
 _FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
@@ -37,27 +40,38 @@ def shared_copies(
     local = {name.split("/")[0].removesuffix(".py") for name in files}
     served: dict[int, int] = {}
     group: list[int] = []
-    words: set[str] = set()  # in any cell so far
-    before: set[str] = set()  # in any cell before the group's last graded cell, that one included
+    words: set[str] = set()  # in any code so far
+    section: set[str] = set()  # names in the prose since the last heading
+    asked: set[str] = set()  # names in the group's exercises
+    before: set[str] = set()  # what the group's exercises may refer to
     imports: set[Import] = set()
 
     def close() -> None:
         served.update(dict.fromkeys(group, group[-1]) if group else {})
         group.clear()
+        asked.clear()
 
     for index, cell in enumerate(cells):
         source = str(cell["source"])
+        if index not in graded and index not in run and cell.get("cell_type") != "code":
+            section = (set() if source.startswith("#") else section) | _words("".join(_MARKED.findall(source)))
+            continue
         if index in run and source.strip() and not _CHECK.fullmatch(source.strip()):
             found = _Definitions.of(source, local)
             if group and (found is None or not found.new_beside(before, imports)):
                 close()
             imports |= found.imports if found is not None else set()
-        words |= set(_WORD.findall(source))
+        words |= _words(_ORIGIN.sub("", source))
         if index in graded:
             group.append(index)
-            before = set(words)
+            asked |= section
+            before = words | asked
     close()
     return served
+
+
+def _words(text: str) -> set[str]:
+    return set(_WORD.findall(text))
 
 
 class _Definitions:
@@ -95,9 +109,10 @@ class _Definitions:
             case ast.ImportFrom(module=str(module), names=aliases, level=0) if top:
                 self.imports |= {(module, a.name, a.asname or a.name) for a in aliases}
                 return module.split(".")[0] not in local and all(a.name != "*" for a in aliases)
-            case ast.Assign(targets=targets, value=value) if all(isinstance(t, ast.Name) for t in targets):
-                self.names |= {t.id for t in targets if isinstance(t, ast.Name)} if top else set()
-                return _plain(value)
+            case ast.Assign(targets=targets, value=value):
+                parts = [part for t in targets for part in (t.elts if isinstance(t, ast.Tuple) else [t])]
+                self.names |= {part.id for part in parts if isinstance(part, ast.Name)} if top else set()
+                return all(isinstance(part, ast.Name) for part in parts) and _plain(value)
             case ast.AnnAssign(target=ast.Name(id=name), annotation=annotation, value=value):
                 self.names |= {name} if top else set()
                 return _plain(annotation) and (value is None or _plain(value))

@@ -182,10 +182,16 @@ def expect_close(
     """
     import numpy as np
 
-    kept = {"given": given, "hint": hint, "misconception": misconception, "credit": credit}
+    kept = {"given": given, "hint": hint, "credit": credit}
     target = np.asarray(expected)
     if got is None:
-        fail(f"{what} is None: does your function return it?", expected=expected, got="None", **kept)
+        fail(
+            f"{what} is None: does your function return it?",
+            expected=expected,
+            got="None",
+            misconception=misconception,
+            **kept,
+        )
     try:
         array = np.asarray(got)
         if array.dtype == object or array.dtype.kind not in "biufc":
@@ -197,32 +203,34 @@ def expect_close(
             f"{what} should be {wanted}, but is of type {type_name(got)}",
             expected=expected,
             got=got,
+            misconception=misconception,
             **kept,
         )
-    kept["misconception"] = misconception or likely_slip(numbers, target)
+    wrong = _what_differs(numbers, target, rtol, atol)
+    if wrong:
+        slip = misconception or likely_slip(numbers, target)
+        fail(f"{what} {wrong}", expected=expected, got=got, misconception=slip, **kept)
+
+
+def _what_differs(numbers: Any, target: Any, rtol: float, atol: float) -> str:
+    """How an answer differs from what is expected, as the rest of a sentence, or ``""``."""
+    import numpy as np
+
     if numbers.shape != target.shape:
-        fail(
-            f"{what} has shape {numbers.shape}, but shape {target.shape} is expected",
-            expected=expected,
-            got=got,
-            **kept,
-        )
+        return f"has shape {numbers.shape}, but shape {target.shape} is expected"
     stray = np.isnan(numbers) & ~np.isnan(target)
     if stray.any():
-        where = "" if numbers.ndim == 0 else f" (first at index {_first(stray)})"
-        fail(f"{what} contains NaN{where}", expected=expected, got=got, **kept)
+        return "contains NaN" + ("" if numbers.ndim == 0 else f" (first at index {_first(stray)})")
     wrong = ~np.isclose(numbers, target, rtol=rtol, atol=atol, equal_nan=True)
-    if wrong.any():
-        if numbers.ndim == 0:
-            fail(f"{what} is not close enough", expected=expected, got=got, **kept)
-        at = _first(wrong)
-        fail(
-            f"{what} differs in {int(wrong.sum())} of {wrong.size} values, first at index {at}: "
-            f"{numbers[at]:.6g} instead of {target[at]:.6g}",
-            expected=expected,
-            got=got,
-            **kept,
-        )
+    if not wrong.any():
+        return ""
+    if numbers.ndim == 0:
+        return "is not close enough"
+    at = _first(wrong)
+    return (
+        f"differs in {int(wrong.sum())} of {wrong.size} values, first at index {at}: "
+        f"{numbers[at]:.6g} instead of {target[at]:.6g}"
+    )
 
 
 def _first(mask: Any) -> tuple[int, ...]:

@@ -13,10 +13,11 @@ import enum
 import functools
 import importlib
 import importlib.util
+import json
 import os
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -383,6 +384,14 @@ def hidden_path(name: str, folder: str | Path | None = None) -> Path | None:
     here = Path.cwd()
     folders = [Path(chosen)] if chosen else [p / "autograder" for p in (here, *here.parents)]
     return next((p for f in folders if (p := f / "hidden" / f"{name}.py").is_file()), None)
+
+
+def instructors_code(autograder: Path, lab: str) -> Iterator[str]:
+    """The code cells of the instructor's notebooks of ``lab``, most of which are in every submission too."""
+    for path in sorted((autograder.parent / "solutions" / lab).glob("*.ipynb")):
+        for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
+            if cell["cell_type"] == "code":
+                yield "".join(cell["source"])
 
 
 def load_file(path: Path, module_name: str) -> ModuleType:

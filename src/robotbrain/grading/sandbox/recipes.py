@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import json
 import os
 import re
 from collections.abc import Iterable, Sequence
@@ -15,7 +14,7 @@ from robotbrain.grading.sandbox import bubblewrap
 from robotbrain.grading.sandbox.filter import compile_filter
 from robotbrain.grading.sandbox.forkserver import Recipe, can_fork
 from robotbrain.grading.student import STUDENT_VARIABLE
-from robotbrain.grading.suite import AUTOGRADER_VARIABLE, SUITES_VARIABLE
+from robotbrain.grading.suite import AUTOGRADER_VARIABLE, SUITES_VARIABLE, instructors_code
 
 COMMON = (
     "numpy",
@@ -130,10 +129,8 @@ def imports_of(autograder: Path, labs: Iterable[str]) -> list[str]:
     """What the labs' notebooks import, for ``names.import_all``, and their visible tests, which every copy needs."""
     modules: list[str] = []
     for lab in labs:
-        for path in (autograder.parent / "solutions" / lab).glob("*.ipynb"):
-            for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
-                if cell["cell_type"] == "code":
-                    modules += _imports("".join(cell["source"]))
+        for source in instructors_code(autograder, lab):
+            modules += _imports(source)
         if (Path(robotbrain.__file__).parent / "grading" / "suites" / f"{lab}.py").is_file():
             modules.append(f"robotbrain.grading.suites.{lab}")
     return list(dict.fromkeys(modules))

@@ -18,9 +18,16 @@ from robotbrain.grading.remote import rehearse
 from robotbrain.grading.remote.raised import StudentInterrupted
 from robotbrain.grading.report import Score
 from robotbrain.grading.runs import Runs
-from robotbrain.grading.source import Submission
+from robotbrain.grading.source import Submission, read_ahead
 from robotbrain.grading.student import STUDENT_VARIABLE
-from robotbrain.grading.suite import AUTOGRADER_VARIABLE, Suite, hidden_path, load_hidden_suite, load_suite
+from robotbrain.grading.suite import (
+    AUTOGRADER_VARIABLE,
+    Suite,
+    hidden_path,
+    instructors_code,
+    load_hidden_suite,
+    load_suite,
+)
 from robotbrain.grading.tester.cells import Output, definitions, failed, hidden_lines, problem, run_cell, visible_part
 from robotbrain.grading.tester.control import Control, ExecutorGone
 from robotbrain.grading.tester.world import RemoteWorld, StudentLost
@@ -31,7 +38,7 @@ _PREPARED: dict[str, tuple[Suite, Suite]] = {}
 
 
 def prepare(autograder: str, labs: Sequence[str] = ()) -> None:
-    """Load the tests of ``labs``, hidden ones included, and fill their caches."""
+    """Load the tests of ``labs``, hidden ones included, read what every submission contains, and fill caches."""
     os.environ[AUTOGRADER_VARIABLE] = autograder
     torch = sys.modules.get("torch")
     if torch is not None:
@@ -40,6 +47,7 @@ def prepare(autograder: str, labs: Sequence[str] = ()) -> None:
         _, complete = suites_of(lab)
         steps: list[Callable[[], object]] = [functools.partial(complete.load_reference, n) for n in complete.references]
         steps += [*complete.warmers, functools.partial(rehearse, complete)]
+        steps.append(functools.partial(read_ahead, instructors_code(Path(autograder), lab)))
         for warm in steps:
             try:
                 warm()
