@@ -2,9 +2,9 @@
 
 A copy keeps the notebook as it is at a graded cell, and costs about as much as all of an exercise's tests. Cells that
 only define new names change nothing for the exercises before them: these can be tested in the copy of a later one. That
-is decided from the source alone, and in doubt there is a copy; a name that an exercise's own prose gives in backticks is
-one that its tests may look for. Within one copy the tests of several exercises follow
-one another, as they do in the notebook.
+is decided from the source alone, and in doubt there is a copy; what an exercise's own prose has in backticks are names
+that its tests may look for. Within one copy the tests of several exercises follow one another, as they do in the
+notebook.
 """
 
 from __future__ import annotations

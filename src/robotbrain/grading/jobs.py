@@ -18,7 +18,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-import nbformat
 from nbformat.notebooknode import NotebookNode
 
 import robotbrain
@@ -36,7 +35,7 @@ if TYPE_CHECKING:
 
 _COUNTED = {".py", ".ipynb", ".json", ".csv", ".onnx", ".npz", ".toml", ".html", ".css", ".js"}
 _PACKAGE = Path(robotbrain.__file__).parent
-VERSION = 1  # of the journal's format: an older one is not read
+VERSION = 2  # of the journal's format: an older one is not read
 
 
 class Bench(Protocol):
@@ -119,7 +118,7 @@ def read_submission(course: Course, task: Task) -> tuple[Healed, dict[str, bytes
 
 def submission_digest(healed: Healed, files: Mapping[str, bytes]) -> str:
     """A digest of what a student handed in, as it is run."""
-    digest = hashlib.sha256(nbformat.writes(healed.notebook).encode())
+    digest = hashlib.sha256(json.dumps(healed.notebook, sort_keys=True).encode())
     for name, data in sorted(files.items()):
         digest.update(f"\0{name}\0{len(data)}\0".encode())
         digest.update(data)
@@ -178,7 +177,7 @@ class Journal:
         self.folder, self.environment = folder, environment
 
     def executed(self, key: str) -> Path:
-        """The executed notebook of an outcome."""
+        """The file of the executed notebook of an outcome."""
         return self.folder / f"{key}.ipynb"
 
     def _record(self, key: str) -> Path:
@@ -203,7 +202,9 @@ class Journal:
             key += "-unsound"  # nothing looks for it
         incidents = list(dict.fromkeys([*healed.repairs, *executed.incidents]))
         marks = Marks(task.student, marks_of(executed.notebook), incidents, executed.seconds, layers=executed.layers)
-        write_text(self.executed(key), nbformat.writes(executed.notebook))
+        write_text(
+            self.executed(key), json.dumps(executed.notebook)
+        )  # indented, as for people, it takes ten times as long
         write_text(self._record(key), json.dumps({"version": VERSION, "marks": marks.to_dict()}, ensure_ascii=False))
         return Done(task.student, task.notebook, key, submission, _scores(marks), sound=executed.sound)
 

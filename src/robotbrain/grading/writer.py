@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import nbformat
+import nbformat.v4
 from nbconvert.exporters.exporter import ResourcesDict
 from nbgrader.converters import Autograde
 from nbgrader.coursedir import CourseDirectory
@@ -108,7 +109,7 @@ class Writer:
         self.gradebook.transact(step)
 
     def _convert(self, student: str, name: str, path: Path) -> str:
-        notebook = nbformat.read(path, as_version=4)
+        notebook = nbformat.v4.reads(path.read_text(encoding="utf-8"))  # ours: valid, and no older format
         notebook.metadata.pop("robotbrain", None)
         names = {"student": student, "assignment": self.lab, "notebook": name, "db_url": self.course.gradebook_url}
         where, resources = ResourcesDict(), ResourcesDict()

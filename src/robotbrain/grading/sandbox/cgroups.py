@@ -8,6 +8,7 @@ this user (``systemd-run --user --scope -p Delegate=yes robotbrain grade-class â
 from __future__ import annotations
 
 import contextlib
+import functools
 import itertools
 import os
 import threading
@@ -43,12 +44,16 @@ class Group:
     def out_of_memory(self) -> int:
         """How many processes of the group the kernel has killed because its memory was used up."""
         total = 0
-        for folder in self.folders:
-            for name in ("memory.events", "memory.oom_control"):
-                with contextlib.suppress(OSError, ValueError):
-                    words = dict(line.split()[:2] for line in (folder / name).read_text().splitlines())
-                    total += int(words.get("oom_kill", 0))
+        for path in self._memory_events:
+            with contextlib.suppress(OSError, ValueError):
+                words = dict(line.split()[:2] for line in path.read_text().splitlines())
+                total += int(words.get("oom_kill", 0))
         return total
+
+    @functools.cached_property
+    def _memory_events(self) -> list[Path]:
+        names = ("memory.events", "memory.oom_control")
+        return [path for folder in self.folders for name in names if (path := folder / name).is_file()]
 
     def peak_bytes(self) -> int:
         """The most memory that the group has used."""

@@ -5,6 +5,7 @@ The messages are those of :class:`~robotbrain.grading.sandbox.process.Cells`: ``
 
 from __future__ import annotations
 
+import ast
 import base64
 import builtins
 import contextlib
@@ -20,8 +21,9 @@ from typing import Any
 from IPython.core.displayhook import DisplayHook
 from IPython.core.displaypub import DisplayPublisher
 from IPython.core.history import HistoryManager
+from IPython.core.inputtransformer2 import TransformerManager
 from IPython.core.interactiveshell import InteractiveShell
-from traitlets import Type
+from traitlets import Instance, Type
 
 Send = Callable[[dict[str, Any]], None]
 
@@ -151,16 +153,47 @@ class _Result(DisplayHook):  # type: ignore[misc]
         pass
 
 
+class Transforms(TransformerManager):  # type: ignore[misc]
+    """Looks for magics among a cell's tokens only where its text is no plain Python: they all make it so.
+
+    IPython looks in every cell, in Python, which takes longer than most cells.
+    """
+
+    def do_token_transforms(self, lines: list[str]) -> list[str]:
+        """Replace magics, system commands and questions by calls."""
+        if self.token_transformers == _TOKEN_TRANSFORMERS and _plain_python("".join(lines)):
+            return lines
+        replaced: list[str] = super().do_token_transforms(lines)
+        return replaced
+
+
+_TOKEN_TRANSFORMERS = TransformerManager().token_transformers
+
+
+def _plain_python(source: str) -> bool:
+    try:
+        ast.parse(source)
+    except (SyntaxError, ValueError, RecursionError, MemoryError):
+        return False
+    return True
+
+
 class Shell(InteractiveShell):  # type: ignore[misc]
     """IPython without terminal, history file, start-up files and background threads."""
 
     displayhook_class = Type(_Result)
     display_pub_class = Type(_Display)
+    input_transformer_manager = Instance(Transforms, ())
 
     def init_history(self) -> None:
         """Keep inputs in memory only."""
         self.history_manager = HistoryManager(shell=self, parent=self, enabled=False)
         self.configurables.append(self.history_manager)
+
+    def should_run_async(self, raw_cell: str, **transformed: Any) -> bool:
+        """Whether the cell awaits something; to see that, IPython compiles it once more."""
+        awaits = any(word in raw_cell for word in ("await", "async"))
+        return awaits and bool(super().should_run_async(raw_cell, **transformed))
 
     def enable_gui(self, gui: object = None) -> None:
         """There is no window system here; ``%matplotlib inline`` is what is on."""
