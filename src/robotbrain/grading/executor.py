@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -82,6 +83,8 @@ class Executor:
         self._state = _State()
         self._layers: list[str] = []
         self._process: StudentProcess | None = None
+        self._ahead: StudentProcess | None = None  # started, and not used yet
+        self._tester_ahead: TesterProcess | None = None
         self._stop = len(notebook.cells)  # cells from here on are not run
         self._graded = [
             Graded(index, cell, question_of(cell.source))
@@ -89,9 +92,6 @@ class Executor:
             if _for_tester(cell)
         ]
         self._by_index = {g.index: g for g in self._graded}
-        run = [i for i, c in enumerate(notebook.cells) if c.cell_type == "code" and not _skipped(c)]
-        ordinary = [i for i in run if i not in self._by_index]
-        self._served = shared_copies(notebook.cells, [i for i in run if i in self._by_index], ordinary, files)
 
     def run(self) -> Execution:
         """Run everything; never raises for what the submission does.
@@ -101,13 +101,16 @@ class Executor:
         """
         start = time.monotonic()
         self._deadline = start + self._limits.wall_s
+        # A process ends with the thread that started it: this one stays until all is over.
+        helper = ThreadPoolExecutor(1, thread_name_prefix="start")
         try:
+            self._prepare(helper)
             self._pass()
             graded = [g for g in self._graded if g.index < self._stop]
             if graded:
                 Scorer(
                     graded,
-                    start_tester=self._start_tester,
+                    start_tester=self._tester,
                     fresh=self._fresh,
                     memory_kills=lambda: self._process.out_of_memory() if self._process is not None else 0,
                     look=self._look,
@@ -118,11 +121,32 @@ class Executor:
                     cell.cell.outputs = cell.outputs or []
         finally:
             self._end_process()
+            if self._ahead is not None:
+                self._ahead.close()
+            if self._tester_ahead is not None:
+                self._tester_ahead.close()
+            helper.shutdown()
         for cell in self._notebook.cells:
             if cell.cell_type == "code":
                 make_gradable(cell)
         incidents = list(dict.fromkeys(self._state.incidents))
         return Execution(self._notebook, incidents, time.monotonic() - start, self._layers)
+
+    def _prepare(self, helper: ThreadPoolExecutor) -> None:
+        """Start the processes and see which copies are needed, side by side: a process in the making mostly waits."""
+        started = helper.submit(self._start_ahead)
+        try:
+            cells = self._notebook.cells
+            run = [i for i, c in enumerate(cells) if c.cell_type == "code" and not _skipped(c)]
+            ordinary = [i for i in run if i not in self._by_index]
+            self._served = shared_copies(cells, [i for i in run if i in self._by_index], ordinary, self._files)
+            if self._graded:
+                self._tester_ahead = self._start_tester()
+        finally:
+            started.result()
+
+    def _start_ahead(self) -> None:
+        self._ahead = self._start_student()
 
     # ------------------------------------------------------------------ the pass
 
@@ -152,7 +176,8 @@ class Executor:
     def _one_pass(self) -> tuple[int, CellEnd] | None:
         """One fresh process; return the index of the cell that ended it and how, or None if all ran."""
         self._end_process()
-        process = self._process = self._starter.start_student(self._limits, self._student, self._files)
+        process, self._ahead = self._ahead or self._start_student(), None
+        self._process = process
         self._layers = process.layers
         number = 0
         for index, cell in enumerate(self._notebook.cells[: self._stop]):
@@ -225,6 +250,14 @@ class Executor:
         cell.outputs = [outputs.error(*reason), *cell.outputs]
 
     # ------------------------------------------------------------------ processes
+
+    def _start_student(self) -> StudentProcess:
+        return self._starter.start_student(self._limits, self._student, self._files)
+
+    def _tester(self) -> TesterProcess:
+        """A fresh tester: the one that was started ahead, and later others."""
+        tester, self._tester_ahead = self._tester_ahead or self._start_tester(), None
+        return tester
 
     def _start_tester(self) -> TesterProcess:
         sources = []
