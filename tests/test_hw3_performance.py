@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,17 @@ from robotbrain.errors import InputError
 from robotbrain.grading import Suite, load_hidden_suite
 from robotbrain.grading.course import find_course, release_differences
 from robotbrain.grading.sample import load_mutants
+from robotbrain.grading.suites import hw3_performance_drives as drives
 from robotbrain.grading.suites import hw3_performance_tools as tools
 from robotbrain.grading.suites import hw3_performance_traces as traces
 from robotbrain.grading.suites import hw3_performance_verdict as verdict
-from robotbrain.pipeline.inherited import BrainSetup, inherited_brain, unmet_requirements
+from robotbrain.pipeline.inherited import (
+    BrainSetup,
+    cropped_planner,
+    inherited_brain,
+    unmet_requirements,
+    whole_map_planner,
+)
 from tests import classes
 
 LAB = "hw3_performance"
@@ -110,6 +118,70 @@ def test_the_median_interval_covers_the_median_as_often_as_it_says() -> None:
 
 
 # ---------------------------------------------------------------- the patient
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        (drives.NANO, 640, 480, "int8", 1, False, "cropped_planner", 1.0, 1, drives.TIME_LIMIT),
+        (drives.NANO, 640, 480, "fp16", None, True, "whole_map_planner", 0.25, 4, drives.TIME_LIMIT),
+        (drives.NX, 640, 480, "int8", 1, True, "free_planner", 2.0, 3, 4.0),
+    ],
+    ids=lambda key: f"{key[0]}-{key[6]}",
+)
+def test_drives_that_grading_looks_up_are_what_they_were(
+    suite: Suite, key: drives.Key, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known = drives.KNOWN[key]
+    monkeypatch.setattr(drives, "KNOWN", {})
+    setup, world, limit = setup_of(key)
+    assert drives.key_of(setup, world, limit) == key
+    again = drives.driven(setup, world, limit)
+    assert again.success == known.success and again.reason == known.reason
+    assert (again.e2e_p95_ms, again.image_p95_ms) == pytest.approx((known.e2e_p95_ms, known.image_p95_ms), rel=1e-6)
+
+
+def setup_of(key: drives.Key) -> tuple[BrainSetup, int, float]:
+    module, width, height, precision, queue, one_thread, planner, age, world, limit = key
+    given = inherited_brain()
+    deployment = replace(
+        given.deployment,
+        image_size=(width, height),  # type: ignore[arg-type]
+        precision=precision,  # type: ignore[arg-type]
+        camera_queue=queue,  # type: ignore[arg-type]
+        one_thread=bool(one_thread),
+    )
+    kits = {f.__name__: f for f in (cropped_planner, whole_map_planner, drives.free_planner)}
+    setup = BrainSetup(str(module), deployment, kits[str(planner)], float(age or 0))
+    return setup, int(world or 0), float(limit or 0)
+
+
+class OneThread:
+    """A student whose planner is their own, and whose nodes all share a thread."""
+
+    def __init__(self, setup: BrainSetup) -> None:
+        self.setup, self.hosted = setup, False
+
+    def __getitem__(self, name: str) -> object:
+        return None
+
+    def run(self, probe: Callable[..., Any], module: str) -> Any:
+        if probe is drives.host_repaired:
+            self.hosted = True
+            return drives.PlannerHost(cropped_planner)
+        deployment = {f.name: getattr(self.setup.deployment, f.name) for f in fields(self.setup.deployment)}
+        there = {"module": module or self.setup.module, "replan_after": self.setup.replan_after}
+        return {"deployment": deployment, "planner": "", **there}
+
+
+def test_a_planner_of_ones_own_on_one_thread_drives_wherever_it_may_earn_points(suite: Suite) -> None:
+    given = inherited_brain()
+    deployment = replace(given.deployment, image_size=(640, 480), precision="int8", camera_queue=1)
+    student = OneThread(replace(given, deployment=deployment, replan_after=1.0))
+    found = drives.drive_repaired(student, 3, drives.NX, time_limit=4.0)  # type: ignore[arg-type]
+    assert not student.hosted and found.e2e_p95_ms > drives.HALF_BUDGETS * drives.BUDGET_MS[drives.NX]
+    found = drives.drive_repaired(student, 1)  # type: ignore[arg-type]
+    assert student.hosted and found.e2e_p95_ms <= drives.BUDGET_MS[drives.NANO]
 
 
 def test_requirements_name_what_is_broken() -> None:

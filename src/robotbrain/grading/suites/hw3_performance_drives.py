@@ -223,16 +223,19 @@ def drive_repaired(student: Student, world: int, module: str = "", time_limit: f
 
     A planner that has a thread of its own delays neither perception nor control, so the kit's may drive in its place
     (:func:`check_planner` tries the student's). On one thread with all others it has to come along, unless the latency
-    is known to earn nothing even with a planner that takes no time.
+    is known to earn nothing with any of the kit's planners, one that takes no time among them.
     """
+    from robotbrain.pipeline.inherited import cropped_planner, whole_map_planner
     from robotbrain.ros import CallbackError
 
     repair = repaired(student, module)
     if not (repair.own_planner and repair.setup.deployment.one_thread):
         return driven(repair.setup, world, time_limit)
-    key = key_of(replace(repair.setup, planner=free_planner), world, time_limit)
-    best = None if key is None else KNOWN.get(key)
-    if best is not None and best.e2e_p95_ms > HALF_BUDGETS * BUDGET_MS[module or NANO]:
+    planners = (free_planner, cropped_planner, whole_map_planner)
+    keys = (key_of(replace(repair.setup, planner=planner), world, time_limit) for planner in planners)
+    known = [KNOWN[key] for key in keys if key in KNOWN]
+    best = min(known, key=lambda run: run.e2e_p95_ms, default=None)
+    if best and len(known) == len(planners) and best.e2e_p95_ms > HALF_BUDGETS * BUDGET_MS[module or NANO]:
         return best
     hosted = student.run(host_repaired, module)
     setup = replace(repair.setup, planner=lambda: relay(hosted))
@@ -262,7 +265,7 @@ class _FreeAnswers:
 
 
 def free_planner() -> Any:
-    """Return a planner node that plans like the kit's, in no time: nobody's is quicker."""
+    """Return a planner node that plans like the kit's, in no time."""
     return relay(_FreeAnswers())
 
 
