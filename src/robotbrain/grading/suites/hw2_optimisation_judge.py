@@ -7,10 +7,8 @@ not seen, and with what chance could have done to so few of them; latency is the
 from __future__ import annotations
 
 import functools
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -227,6 +225,13 @@ def _network_of(channels: tuple[int, ...], quantised: bool) -> bytes:
 
 
 @functools.lru_cache(maxsize=16)
+def _graph_of(channels: tuple[int, ...], quantised: bool) -> Any:
+    from robotbrain.jetson.twin.predictor import as_graph
+
+    return as_graph(_network_of(channels, quantised))
+
+
+@functools.lru_cache(maxsize=16)
 def latency_of(question: Reading) -> float:
     """Return the twin's latency (ms) for a question, which depends on nothing else."""
     q = question
@@ -236,10 +241,7 @@ def latency_of(question: Reading) -> float:
 def _asked(question: Reading, **settings: Any) -> Any:
     from robotbrain.jetson import predict
 
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "network.onnx"
-        path.write_bytes(_network_of(question.channels, question.quantised))
-        return predict(path, question.module, **settings)
+    return predict(_graph_of(question.channels, question.quantised), question.module, **settings)
 
 
 def compare_readings(student: Any, question: Reading, rng: np.random.Generator) -> None:

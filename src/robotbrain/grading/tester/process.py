@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import contextlib
 import functools
+import gc
 import os
 import socket
 import sys
@@ -34,6 +35,7 @@ from robotbrain.grading.tester.world import RemoteWorld, StudentLost
 
 _CELL_S = 300.0  # for a cell of assertions where the job does not say
 _MEMORY_BYTES = 4 << 30
+_COLLECT_AFTER = 20_000  # objects; a tester does not live long enough to be worth tidying more often
 _PREPARED: dict[str, tuple[Suite, Suite]] = {}
 
 
@@ -69,6 +71,7 @@ def main(job: dict[str, Any], sockets: Sequence[socket.socket]) -> None:
     os.environ[STUDENT_VARIABLE] = job["student"]
     os.environ["NBGRADER_EXECUTION"] = "autograde"
     _limit_memory(_MEMORY_BYTES)
+    gc.set_threshold(_COLLECT_AFTER)
     try:
         Session(job, Control(sockets[0])).serve()
     except ExecutorGone:  # the executor needs no answer any more
