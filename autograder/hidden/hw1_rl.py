@@ -9,6 +9,7 @@ from robotbrain.grading.suites import hw1_rl_evidence as evidence
 from robotbrain.grading.suites import hw1_rl_learning as learning
 from robotbrain.grading.suites import hw1_rl_memory as memory
 from robotbrain.grading.suites import hw1_rl_policy as policy
+from robotbrain.grading.suites import judging
 
 suite = Suite.extending("hw1_rl")
 
@@ -30,7 +31,7 @@ VERDICTS = {"f": "breaks", "g": "fine", "h": "breaks", "i": "fine", "j": "breaks
 
 @suite.test("bugs", points=2, name="f to j", reread="Exercise 1.1, the listing")
 def bugs_second(student):
-    evidence.compare_verdicts(student.VERDICTS, VERDICTS)
+    judging.compare_verdicts(student.VERDICTS, VERDICTS, evidence.VERDICT_HINTS)
 
 
 # ---------------------------------------------------------------- Part 2: memory

@@ -13,6 +13,7 @@ from robotbrain.grading.suites import hw1_rl_evidence as evidence
 from robotbrain.grading.suites import hw1_rl_learning as learning
 from robotbrain.grading.suites import hw1_rl_memory as memory
 from robotbrain.grading.suites import hw1_rl_policy as policy
+from robotbrain.grading.suites import judging
 from robotbrain.grading.suites.training import first_steps
 
 suite = Suite("hw1_rl")
@@ -161,7 +162,7 @@ suite.warm_students(first_steps)
 
 @suite.test("bugs", points=2, name="a to e", reread="Exercise 1.1, the listing")
 def bugs_first(student: Any) -> None:
-    evidence.compare_verdicts(student.VERDICTS, evidence.VERDICTS)
+    judging.compare_verdicts(student.VERDICTS, evidence.VERDICTS, evidence.VERDICT_HINTS)
 
 
 # ---------------------------------------------------------------- Part 2: memory

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from scipy.stats import beta, norm
 
-from robotbrain.grading import expect, expect_close, fail
+from robotbrain.grading import expect_close, fail
 
 VERDICTS = {"a": "breaks", "b": "wastes", "c": "wastes", "d": "breaks", "e": "breaks"}
 """Of the first five of the ten observations about the outline's listing; the others are in the hidden tests.
 tests/test_hw1_rl.py tries out those that can be tried."""
 
-_VERDICT_HINTS = {
+VERDICT_HINTS = {
     "a": "done-means-ended",
     "b": "who-is-optimised",
     "c": "who-is-optimised",
@@ -43,28 +43,6 @@ HINTS = {
 }
 
 Z = 1.96
-
-
-def compare_verdicts(answer: Any, key: Mapping[str, str]) -> None:
-    """Compare with the key; each letter counts the same."""
-    if not isinstance(answer, Mapping):
-        fail("VERDICTS should be a dict", got=answer, expected='{"a": "fine", ...}')
-    words = ("breaks", "wastes", "fine")
-    given = {letter: word if isinstance(word := answer.get(letter), str) else "no answer" for letter in key}
-    unknown = {k: word for k, word in given.items() if k in answer and word not in words}
-    expect(not unknown, "that is not one of the three words", got=unknown, expected=words)
-    wrong = [letter for letter in key if given[letter] != key[letter]]
-    if not wrong:
-        return
-    right = len(key) - len(wrong)
-    first = wrong[0]
-    fail(
-        f"{right} of {len(key)} are right; look again at {first!r}",
-        got=f"{first}: {given[first]}",
-        hint=_VERDICT_HINTS[first],
-        credit=right / len(key),
-        expected=f"another of {', '.join(words)}",
-    )
 
 
 def exact_bound(successes: int, n: int, doubt: float = 0.05) -> float:

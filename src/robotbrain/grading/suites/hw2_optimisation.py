@@ -14,6 +14,7 @@ from robotbrain.grading.suites import hw2_optimisation_judge as judge
 from robotbrain.grading.suites import hw2_optimisation_learning as learning
 from robotbrain.grading.suites import hw2_optimisation_network as network_file
 from robotbrain.grading.suites import hw2_optimisation_numbers as numbers
+from robotbrain.grading.suites import judging
 from robotbrain.grading.suites.training import first_steps
 
 suite = Suite("hw2_optimisation")
@@ -76,7 +77,7 @@ suite.warm_students(first_steps)
 
 @suite.test("bugs", points=2, name="a to e", reread="Exercise 1.1, the listing")
 def bugs_first(student: Any) -> None:
-    numbers.compare_verdicts(student.VERDICTS, numbers.VERDICTS)
+    judging.compare_verdicts(student.VERDICTS, numbers.VERDICTS, numbers.VERDICT_HINTS)
 
 
 # ---------------------------------------------------------------- Part 2: numbers

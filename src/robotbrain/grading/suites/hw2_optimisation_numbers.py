@@ -21,7 +21,7 @@ VERDICTS = {"a": "breaks", "b": "fine", "c": "wastes", "d": "breaks", "e": "fine
 """Of the first five of the ten observations about the listing; the others are in the hidden tests.
 tests/test_hw2_optimisation.py tries out those that can be tried."""
 
-_VERDICT_HINTS = {
+VERDICT_HINTS = {
     "a": "zeros-can-move",
     "b": "biases-are-few",
     "c": "who-is-optimised",
@@ -92,27 +92,6 @@ HINTS = {
     "take-hooks-off": "Remove the hooks (`handle.remove()`): they would go on to keep every image that ever passes.",
     "leave-as-found": "Leave the network as you found it: its mode, its weights, and its statistics.",
 }
-
-
-def compare_verdicts(answer: Any, key: Mapping[str, str]) -> None:
-    """Compare with the key; each letter counts the same."""
-    if not isinstance(answer, Mapping):
-        fail("VERDICTS should be a dict", got=answer, expected='{"a": "fine", ...}')
-    words = ("breaks", "wastes", "fine")
-    given = {letter: word if isinstance(word := answer.get(letter), str) else "no answer" for letter in key}
-    wrong = [letter for letter in key if given[letter] != key[letter]]
-    if not wrong:
-        return
-    right = len(key) - len(wrong)
-    unknown = {k: given[k] for k in wrong if k in answer and given[k] not in words}
-    expect(not unknown, "that is not one of the three words", got=unknown, expected=words, credit=right / len(key))
-    first = wrong[0]
-    fail(
-        f"{right} of {len(key)} are right; look again at {first!r}",
-        got=f"{first}: {given[first]}",
-        hint=_VERDICT_HINTS[first],
-        credit=right / len(key),
-    )
 
 
 # ---------------------------------------------------------------- scale and zero point

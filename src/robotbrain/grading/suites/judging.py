@@ -6,16 +6,18 @@ that is no value at all. A stand-in is never equal to a number, and nothing here
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robotbrain.grading.expect import expect_close
+from robotbrain.grading.expect import expect, expect_close, fail
 
 Mistakes = Iterable[tuple[str, Any]]
 """Pairs (hint, what this mistake answers)."""
+VERDICT_WORDS = ("breaks", "wastes", "fine")
+"""What may be said of a part of a program."""
 
 
 def as_numbers(answer: Any) -> NDArray[np.float64] | None:
@@ -89,3 +91,31 @@ def _close(a: NDArray[np.float64], b: NDArray[np.float64], atol: float, rtol: fl
     if not same.all():
         same |= np.isnan(a) & np.isnan(b)
     return bool(same.all())
+
+
+def compare_verdicts(answer: Any, key: Mapping[str, str], hints: Mapping[str, str]) -> None:
+    """Compare what is said of the lettered parts of a program with the key; each letter counts the same.
+
+    Args:
+        answer: a dict from letters to the words in ``VERDICT_WORDS``.
+        key: the right one.
+        hints: for each letter.
+    """
+    if not isinstance(answer, Mapping):
+        fail("VERDICTS should be a dict", got=answer, expected='{"a": "fine", ...}')
+    given = {letter: word if isinstance(word := answer.get(letter), str) else "no answer" for letter in key}
+    wrong = [letter for letter in key if given[letter] != key[letter]]
+    if not wrong:
+        return
+    right = len(key) - len(wrong)
+    credit = right / len(key)
+    unknown = {letter: given[letter] for letter in wrong if letter in answer and given[letter] not in VERDICT_WORDS}
+    expect(not unknown, "that is not one of the three words", got=unknown, expected=VERDICT_WORDS, credit=credit)
+    first = wrong[0]
+    fail(
+        f"{right} of {len(key)} are right; look again at {first!r}",
+        got=f"{first}: {given[first]}",
+        expected=f"another of {', '.join(VERDICT_WORDS)}",
+        hint=hints[first],
+        credit=credit,
+    )
