@@ -22,6 +22,7 @@ from robotbrain.grading import bench as benches
 from robotbrain.grading.bench import Bench
 from robotbrain.grading.execute import Execution, Limits
 from robotbrain.grading.sandbox import bubblewrap, recipes
+from robotbrain.grading.sandbox.forkserver import ForkServer, Recipe, ServerDied
 from robotbrain.grading.sandbox.layers import required_missing, warning_of
 
 LIMITS = Limits(cell_s=2.0, graded_s=6.0, grace_s=0.5, wall_s=40.0, output_bytes=100_000, memory_bytes=600 << 20)
@@ -284,6 +285,27 @@ def test_a_fork_server_killed_in_mid_run_costs_nothing(light_bench: Callable[...
 def _kill(process: psutil.Process) -> None:
     with contextlib.suppress(psutil.NoSuchProcess):
         process.send_signal(signal.SIGKILL)
+
+
+def test_closing_does_not_wait_for_a_server_that_still_starts() -> None:
+    before = {p.pid for p in psutil.Process().children(recursive=True)}
+    server = ForkServer(Recipe(entry="os:getpid", prepare="signal:pause"))  # it never gets ready
+    outcome: list[object] = []
+
+    def warm_up() -> None:
+        try:
+            outcome.append(server.warm_up())
+        except ServerDied as died:
+            outcome.append(died)
+
+    starting = threading.Thread(target=warm_up)
+    starting.start()
+    while not {p.pid for p in psutil.Process().children()} - before:
+        time.sleep(0.01)
+    server.close()
+    starting.join()
+    assert isinstance(outcome[0], ServerDied) and server.starts == 0
+    assert {p.pid for p in psutil.Process().children(recursive=True)} <= before
 
 
 def test_closing_ends_what_runs_and_leaves_no_process(light_bench: Callable[..., Bench]) -> None:

@@ -25,6 +25,7 @@ from robotbrain.grading.sandbox.cgroups import Cgroups
 from robotbrain.grading.sandbox.forkserver import ForkServer, ServerDied
 from robotbrain.grading.sandbox.layers import NAMES, Layer, layers_of, required_missing
 from robotbrain.grading.sandbox.process import Room, StartError, StudentProcess
+from robotbrain.grading.scheduler import usable_cores
 from robotbrain.grading.tester_link import TesterProcess
 
 _TRIES = 3
@@ -63,6 +64,8 @@ class Bench:
         self._layers: list[Layer] | None = None
         self._lock = threading.Lock()
         _remove_abandoned()
+        if preload_labs and usable_cores() > 1:  # both servers take seconds to import what they need
+            threading.Thread(target=self._warm_testers, name="warm-testers", daemon=True).start()
         if require_sandbox:
             missing = required_missing(self.layers)
             if missing:
@@ -121,6 +124,10 @@ class Bench:
         self._students.close()
         self._testers.close()
         self._cgroups.close()
+
+    def _warm_testers(self) -> None:
+        with contextlib.suppress(ServerDied, OSError):  # whoever needs a tester is told
+            self._testers.warm_up()
 
     def start_student(self, limits: Limits, student: str, files: Mapping[str, bytes]) -> StudentProcess:
         """A fresh student's process with the submission's files."""

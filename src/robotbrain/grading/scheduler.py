@@ -17,13 +17,17 @@ _MEMORY_BYTES = 1 << 30  # free memory for each submission that runs; most need 
 _POLL_S = 0.5  # Windows does not interrupt a wait without an end
 
 
+def usable_cores() -> int:
+    """How many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def fitting_workers() -> int:
     """How many submissions to run at the same time here: one per core, as far as memory allows.
 
     More per core bring nothing: the processes of one submission seldom wait, and those of two fight for the cache.
     """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, min(cores, int(psutil.virtual_memory().available // _MEMORY_BYTES)))
+    return max(1, min(usable_cores(), int(psutil.virtual_memory().available // _MEMORY_BYTES)))
 
 
 def run(

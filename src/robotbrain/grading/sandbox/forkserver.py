@@ -27,6 +27,7 @@ from robotbrain.grading.sandbox.spawn import share
 
 _STARTUP_S = 120.0
 _ANSWER_S = 60.0
+_SOON_S = 0.2
 _LARGEST_ANSWER = 1 << 20
 _ENVIRONMENT = {
     "OMP_NUM_THREADS": "1",  # sums come out the same on every machine; and a process with threads must not fork
@@ -124,13 +125,19 @@ class ForkServer:
             raise AssertionError
 
     def close(self) -> None:
-        """End the server and all its children, for good; safe to call twice."""
+        """End the server and all its children, for good, also while it starts; safe to call twice."""
         self._closed = True
-        with self._lock:
+        while not self._lock.acquire(timeout=_SOON_S):  # a server that still starts would be waited for
+            starting = self._popen
+            if starting is not None:
+                kill_tree(starting)
+        try:
             self._stop()
             if self._keeper is not None:
                 self._keeper.shutdown()
                 self._keeper = None
+        finally:
+            self._lock.release()
 
     def _ask(self, channel: Channel, job: Mapping[str, Any], sockets: Sequence[socket.socket]) -> Process:
         channel.send({"job": dict(job), "fds": len(sockets)}, [s.fileno() for s in sockets], _ANSWER_S)
