@@ -200,9 +200,15 @@ def _grade(base: Path, pause_s: float) -> classroom.ClassResult:
 
 def _start(base: Path, pause_s: float) -> multiprocessing.process.BaseProcess:
     """The same in a process of its own; forked, because it has imported everything by now."""
-    process = multiprocessing.get_context("fork").Process(target=_grade, args=(base, pause_s))
+    process = multiprocessing.get_context("fork").Process(target=_grade_for_a_person, args=(base, pause_s))
     process.start()
     return process
+
+
+def _grade_for_a_person(base: Path, pause_s: float) -> None:
+    """Heed Ctrl-C, which a shell's background job ignores, and what that starts, such as these tests."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    _grade(base, pause_s)
 
 
 def _wait(process: multiprocessing.process.BaseProcess, moment: Callable[[], bool]) -> None:
