@@ -53,6 +53,8 @@ def test_new_definitions_change_nothing_that_was_there(between: str) -> None:
         "NEW, GAIN = 1, 3",
         "NEW, scale.gain = 1, 3",
         "NEW, *GAIN = 1, 3",
+        "NEW, OLD = GAIN",  # which may be an iterator
+        "NEW, OLD = (*GAIN,)",
         "import heapq as np",
         "from numpy import abs as GAIN",
         "import cheat",
@@ -100,6 +102,20 @@ def test_other_prose_defines_nothing_and_asks_for_nothing() -> None:
     later = ("#1", "def smooth(): pass", "#2")
     assert copies("%%textA smooth path", *later) == {1: 3, 3: 3}
     assert copies("%%textYou will write `smooth`", "%%text# Exercise 1", "#2", *later[1:]) == {2: 4, 4: 4}
+
+
+def test_names_in_prose_are_found_between_any_marks() -> None:
+    later = ("#1", "def smooth(): pass", "#2")
+    for prose in ("```python\nx\n```\nWrite `smooth(path)`.", "``a`` and `smooth`", "```\nsmooth()\n```"):
+        assert copies(f"%%text{prose}", *later) == {1: 1, 3: 3}
+
+
+def test_an_import_is_only_repeated_while_its_name_means_the_same() -> None:
+    first, other = "from time import time", "import time\ndef f():\n    return time.perf_counter()"
+    assert copies(first, "#1", first, "#3") == {1: 3, 3: 3}
+    assert copies(first, other, "#2", first, "#4") == {2: 2, 4: 4}
+    assert copies(f"{first}\n{other}", "#1", first, "#3") == {1: 1, 3: 3}
+    assert copies(first, "time = make()", "#2", first, "#4") == {2: 2, 4: 4}
 
 
 def test_where_an_import_comes_from_is_no_name() -> None:

@@ -11,12 +11,13 @@ from __future__ import annotations
 
 import ast
 import re
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 _WORD = re.compile(r"\w+")
 _ORIGIN = re.compile(r"^\s*from\s+[\w.]+\s+import\b", re.MULTILINE)  # binds none of the names in it
-_MARKED = re.compile(r"`[^`]+`")  # how prose names what is to be written
+_MARKED = re.compile(r"(`+)(.+?)\1", re.DOTALL)  # how prose names what is to be written
 _CHECK = re.compile(r"lab\.check\((['\"])\w+\1\)")
 _HARMLESS = {"dataclass", "field", "no_grad", "inference_mode", "lru_cache", "cache", "wraps", "total_ordering"}
 _FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
@@ -54,13 +55,14 @@ def shared_copies(
     for index, cell in enumerate(cells):
         source = str(cell["source"])
         if index not in graded and index not in run and cell.get("cell_type") != "code":
-            section = (set() if source.startswith("#") else section) | _words("".join(_MARKED.findall(source)))
+            marked = " ".join(text for _, text in _MARKED.findall(source))
+            section = (set() if source.startswith("#") else section) | _words(marked)
             continue
         if index in run and source.strip() and not _CHECK.fullmatch(source.strip()):
             found = _Definitions.of(source, local)
             if group and (found is None or not found.new_beside(before, imports)):
                 close()
-            imports |= found.imports if found is not None else set()
+            imports = _still_meant(imports, _words(source), found.imports if found is not None else set())
         words |= _words(_ORIGIN.sub("", source))
         if index in graded:
             group.append(index)
@@ -68,6 +70,13 @@ def shared_copies(
             before = words | asked
     close()
     return served
+
+
+def _still_meant(imports: set[Import], words: Collection[str], more: set[Import]) -> set[Import]:
+    """The imports whose names still mean what they brought in after a cell with these words, which imports ``more``."""
+    known = {i for i in imports if i in more or i[2] not in words} | more
+    names = Counter(name for *_, name in known)
+    return {i for i in known if names[i[2]] == 1}
 
 
 def _words(text: str) -> set[str]:
@@ -112,7 +121,9 @@ class _Definitions:
             case ast.Assign(targets=targets, value=value):
                 parts = [part for t in targets for part in (t.elts if isinstance(t, ast.Tuple) else [t])]
                 self.names |= {part.id for part in parts if isinstance(part, ast.Name)} if top else set()
-                return all(isinstance(part, ast.Name) for part in parts) and _plain(value)
+                unpacked = [len(t.elts) for t in targets if isinstance(t, ast.Tuple)]
+                same = isinstance(value, ast.Tuple) and all(n == len(value.elts) for n in unpacked)
+                return all(isinstance(part, ast.Name) for part in parts) and (same or not unpacked) and _plain(value)
             case ast.AnnAssign(target=ast.Name(id=name), annotation=annotation, value=value):
                 self.names |= {name} if top else set()
                 return _plain(annotation) and (value is None or _plain(value))

@@ -85,6 +85,7 @@ class Executor:
         self._process: StudentProcess | None = None
         self._ahead: StudentProcess | None = None  # started, and not used yet
         self._tester_ahead: TesterProcess | None = None
+        self._testing: TesterProcess | None = None
         self._stop = len(notebook.cells)  # cells from here on are not run
         self._graded = [
             Graded(index, cell, question_of(cell.source))
@@ -120,12 +121,12 @@ class Executor:
                 for cell in graded:
                     cell.cell.outputs = cell.outputs or []
         finally:
+            helper.shutdown()  # first: what it starts is to be ended, too
             self._end_process()
             if self._ahead is not None:
                 self._ahead.close()
             if self._tester_ahead is not None:
                 self._tester_ahead.close()
-            helper.shutdown()
         for cell in self._notebook.cells:
             if cell.cell_type == "code":
                 make_gradable(cell)
@@ -233,9 +234,11 @@ class Executor:
         return end
 
     def _look(self) -> None:
-        """Raise if the student's processes were ended from outside."""
+        """Raise if the student's processes or the tester were ended from outside."""
         if self._process is not None and self._process.taken_away():
             raise Lost(_LOST)
+        if self._testing is not None and self._testing.taken_away():
+            raise Lost("the tester was ended from outside")
 
     def _blame(self, index: int, end: CellEnd) -> None:
         """Leave out, from now on, the cell that ended the process."""
@@ -255,9 +258,13 @@ class Executor:
         return self._starter.start_student(self._limits, self._student, self._files)
 
     def _tester(self) -> TesterProcess:
-        """A fresh tester: the one that was started ahead, and later others."""
-        tester, self._tester_ahead = self._tester_ahead or self._start_tester(), None
-        return tester
+        """A fresh tester: the one that was started ahead, if it still runs, and later others."""
+        tester, self._tester_ahead = self._tester_ahead, None
+        if tester is not None and not tester.alive():
+            tester.close()
+            tester = None
+        self._testing = tester or self._start_tester()
+        return self._testing
 
     def _start_tester(self) -> TesterProcess:
         sources = []

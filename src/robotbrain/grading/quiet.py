@@ -7,7 +7,7 @@ import io
 import random
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 KEPT_OUTPUT = 2_000
 """Characters of a test's prints that a report may show."""
@@ -55,6 +55,22 @@ def seed_generators(*labels: str) -> None:
     numpy = sys.modules.get("numpy")  # not imported here: a lab without numpy stays without
     if numpy:
         numpy.random.seed(seed)
+
+
+def settings_keeper() -> Callable[[], None]:
+    """Return a function that puts NumPy's and torch's global settings back to what they are now."""
+    numpy, torch = sys.modules.get("numpy"), sys.modules.get("torch")
+    errors = numpy.geterr() if numpy else {}
+    grad, dtype = (torch.is_grad_enabled(), torch.get_default_dtype()) if torch else (True, None)
+
+    def restore() -> None:
+        if numpy:
+            numpy.seterr(**errors)
+        if torch:
+            torch.set_grad_enabled(grad)
+            torch.set_default_dtype(dtype)
+
+    return restore
 
 
 @contextlib.contextmanager

@@ -96,7 +96,7 @@ class Scorer:
         start_tester: makes a tester.
         fresh: makes a copy of the student's process as the notebook left it; None if that is not possible any more.
         memory_kills: how many of the student's processes have run out of memory so far.
-        look: called when a snapshot has ended; raises if it was the machine that ended the student's processes.
+        look: called when a snapshot or the tester has ended; raises if it was the machine that ended them.
         limits: of this run.
         incidents: what goes wrong is added here, in words.
     """
@@ -145,6 +145,7 @@ class Scorer:
         try:
             answer = self._ask(graded, question)
         except TesterDied as died:
+            self._look()
             self._lose_tester()
             self._incidents.append(f"{graded.name}: the tester ended or did not answer ({died})")
             self._fail(graded, "TesterDied", "the test of this exercise ended its own process; tell the teacher")

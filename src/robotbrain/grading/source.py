@@ -13,7 +13,7 @@ import contextlib
 import functools
 import importlib
 import re
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import FunctionType, ModuleType
@@ -233,7 +233,7 @@ class _Text:
 
     Attributes:
         statements: in order.
-        naming: the parts, wherever they stand, that may give a name to something that is imported; in order.
+        naming: the parts, wherever they stand, that may give a name to something that is imported.
     """
 
     statements: tuple[ast.stmt, ...] = ()
@@ -284,12 +284,12 @@ def _children(node: ast.AST) -> list[ast.AST]:
 
 
 def _walk(node: ast.AST) -> Iterator[ast.AST]:
-    """``node`` and all nodes below it, in the order of the text; three times as fast as ``ast.walk``."""
-    todo = [node]
+    """``node`` and all nodes below it, in the order of ``ast.walk``, in a third of its time."""
+    todo = deque([node])
     while todo:
-        node = todo.pop()
+        node = todo.popleft()
         yield node
-        todo += reversed(_children(node))
+        todo += _children(node)
 
 
 def _pieces(statement: ast.stmt) -> Iterator[tuple[str, _Piece]]:

@@ -15,6 +15,8 @@ from robotbrain.grading.sandbox.forkserver import ForkServer
 from robotbrain.grading.sandbox.handle import Process
 from robotbrain.grading.sandbox.spawn import share
 
+_SOON_S = 0.2
+
 
 class TesterDied(Exception):  # noqa: N818 - what happened
     """The tester ended, or does not answer any more."""
@@ -36,6 +38,7 @@ class TesterProcess:
         try:
             with theirs:
                 self._process: Process | None = server.start(job, [theirs])
+                self._server, self._generation = server, server.starts
         except BaseException:
             self.socket.close()
             raise
@@ -45,6 +48,14 @@ class TesterProcess:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def alive(self) -> bool:
+        """Whether it still runs."""
+        return self._process is not None and not self._process.wait(0)
+
+    def taken_away(self) -> bool:
+        """Whether it ended because its fork server did: no doing of a test."""
+        return self._server.starts != self._generation or self._server.ends_within(_SOON_S)
 
     def send(self, request: Mapping[str, Any], sock: socket.socket | None = None) -> None:
         """Send ``request``, and ``sock`` with it.

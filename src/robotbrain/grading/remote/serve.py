@@ -23,7 +23,7 @@ from typing import Any, Protocol
 
 from robotbrain.grading.expect import CannotCrossError
 from robotbrain.grading.forbidden import why_exercise_forbidden
-from robotbrain.grading.quiet import BoundedText, seed_generators
+from robotbrain.grading.quiet import BoundedText, seed_generators, settings_keeper
 from robotbrain.grading.remote import values, wire
 from robotbrain.grading.remote.peer import ANSWER, ERROR, INTERRUPTED, REQUEST, Peer
 from robotbrain.grading.remote.proxies import Callback
@@ -76,6 +76,9 @@ class Server(Peer):
         self._output = BoundedText()
         self._running = False  # the student's code, which an interrupt may break into
         self._interrupted = False
+        self._restore_settings: Callable[[], None] = lambda: None
+        with contextlib.suppress(Exception):  # the student's code may have changed what is asked here
+            self._restore_settings = settings_keeper()
         self._operations: dict[str, Callable[..., Any]] = {
             "hello": self._hello,
             "name": self._name,
@@ -246,6 +249,8 @@ class Server(Peer):
         """A test begins: whatever an earlier one left is put aside."""
         self._interrupted = False
         self._output.clear()
+        with contextlib.suppress(Exception):
+            self._restore_settings()
         if threading.current_thread() is threading.main_thread():
             warnings.simplefilter("ignore")
         seed_generators(*labels)

@@ -105,6 +105,17 @@ class ForkServer:
                 self._ensure()
             return self.ready
 
+    def ends_within(self, timeout_s: float) -> bool:
+        """Whether the server has ended, or does so within ``timeout_s``."""
+        popen = self._popen
+        if popen is None:
+            return False
+        try:
+            popen.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            return False
+        return True
+
     def start(self, job: Mapping[str, Any], sockets: Sequence[socket.socket]) -> Process:
         """Start a child that calls the recipe's entry with ``job`` and ``sockets``, which stay open here too.
 
