@@ -21,6 +21,7 @@ from nbformat.v4 import new_code_cell, new_notebook, output_from_msg
 from robotbrain.grading import intake
 from robotbrain.grading.bench import Bench
 from robotbrain.grading.execute import Execution, Limits, make_gradable
+from robotbrain.grading.executor import Executor
 from robotbrain.grading.marks import Mark, marks_of
 from robotbrain.grading.outputs import CellOutputs
 from robotbrain.grading.report import SCORE_MIME
@@ -88,6 +89,23 @@ def test_a_fork_server_killed_during_the_tests_costs_nothing(
         servers = set(psutil.Process().children(recursive=True)) - before
         marks, incidents = graded(bench, heal(mean=slow))
     assert killers and points(marks) == [4.0, 6.0, 5.0] and incidents == []
+
+
+def test_a_tester_that_ended_while_it_waited_is_replaced(
+    bench: Bench, heal: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    prepare, killed = Executor._prepare, list[int]()
+
+    def _prepare(executor: Executor, helper: Any) -> None:
+        prepare(executor, helper)
+        waiting: Any = executor._tester_ahead
+        killed.append(waiting._process.pid)
+        kill(psutil.Process(killed[0]))
+        assert waiting._process.wait(20)
+
+    monkeypatch.setattr(Executor, "_prepare", _prepare)
+    marks, incidents = graded(bench, heal())
+    assert killed and points(marks) == [4.0, 6.0, 5.0] and incidents == []
 
 
 def kill(process: psutil.Process) -> None:

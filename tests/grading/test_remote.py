@@ -826,6 +826,27 @@ def test_an_interrupt_reaches_student_code_and_only_that() -> None:
         process.wait()
 
 
+def test_what_one_exercise_sets_for_the_whole_process_is_put_back_for_the_next() -> None:
+    def spoil() -> None:
+        torch.set_grad_enabled(False)
+        torch.set_default_dtype(torch.float64)
+        np.seterr(divide="raise")
+
+    def settings_now() -> list[Any]:
+        return [torch.is_grad_enabled(), torch.get_default_dtype() == torch.float32, np.geterr()["divide"]]
+
+    student = loopback({"spoil": spoil, "now": settings_now}, Suite("toy"))
+    before = student.now()
+    assert before[:2] == [True, True] and before[2] != "raise"
+    try:
+        student.spoil()
+        assert student.now() == [False, False, "raise"]
+        student._peer.request("begin", "toy", "next")
+        assert student.now() == before
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
 def test_the_peer_lists_its_constants_once() -> None:
     """Tags are positions in a range: a new one must not shift the others silently."""
     assert (wire_values.LIST, wire_values.ARRAY, wire_values.NAMESPACE, wire_values.DATA, YOURS) == (0, 13, 17, 18, 22)
