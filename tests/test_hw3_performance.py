@@ -177,11 +177,14 @@ class OneThread:
 def test_a_planner_of_ones_own_on_one_thread_drives_wherever_it_may_earn_points(suite: Suite) -> None:
     given = inherited_brain()
     deployment = replace(given.deployment, image_size=(640, 480), precision="int8", camera_queue=1)
-    student = OneThread(replace(given, deployment=deployment, replan_after=1.0))
+    student = OneThread(replace(given, deployment=deployment))
     found = drives.drive_repaired(student, 3, drives.NX, time_limit=4.0)  # type: ignore[arg-type]
     assert not student.hosted and found.e2e_p95_ms > drives.HALF_BUDGETS * drives.BUDGET_MS[drives.NX]
     found = drives.drive_repaired(student, 1)  # type: ignore[arg-type]
     assert student.hosted and found.e2e_p95_ms <= drives.BUDGET_MS[drives.NANO]
+    near = OneThread(replace(given, deployment=deployment, replan_after=1.0))  # another planner might come below it
+    drives.drive_repaired(near, 3, drives.NX, time_limit=4.0)  # type: ignore[arg-type]
+    assert near.hosted
 
 
 def test_requirements_name_what_is_broken() -> None:
