@@ -287,7 +287,9 @@ def _kill(process: psutil.Process) -> None:
         process.send_signal(signal.SIGKILL)
 
 
-def test_closing_does_not_wait_for_a_server_that_still_starts() -> None:
+@pytest.mark.timeout(60)  # whoever waits for the server waits an hour
+def test_closing_does_not_wait_for_a_server_that_still_starts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("robotbrain.grading.sandbox.forkserver._STARTUP_S", 3600.0)
     before = {p.pid for p in psutil.Process().children(recursive=True)}
     server = ForkServer(Recipe(entry="os:getpid", prepare="signal:pause"))  # it never gets ready
     outcome: list[object] = []
@@ -302,6 +304,7 @@ def test_closing_does_not_wait_for_a_server_that_still_starts() -> None:
     starting.start()
     while not {p.pid for p in psutil.Process().children()} - before:
         time.sleep(0.01)
+    assert starting.is_alive()
     server.close()
     starting.join()
     assert isinstance(outcome[0], ServerDied) and server.starts == 0
