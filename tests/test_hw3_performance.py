@@ -141,6 +141,12 @@ def test_drives_that_grading_looks_up_are_what_they_were(
     assert (again.e2e_p95_ms, again.image_p95_ms) == pytest.approx((known.e2e_p95_ms, known.image_p95_ms), rel=1e-6)
 
 
+def test_every_drive_that_grading_looks_up_is_found_by_the_brain_that_made_it(suite: Suite) -> None:
+    assert drives.KNOWN
+    for key in drives.KNOWN:
+        assert drives.key_of(*setup_of(key)) == key
+
+
 def setup_of(key: drives.Key) -> tuple[BrainSetup, int, float]:
     module, width, height, precision, queue, one_thread, planner, age, world, limit = key
     given = inherited_brain()
