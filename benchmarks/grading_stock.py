@@ -8,9 +8,9 @@ name in the environment (on which random draws of tests depend). The kit runs wi
 take turns, each in a process of its own, on one core and on two (``taskset``); the kit runs as many submissions at the
 same time as it does by default on that many cores, stock nbgrader one after the other, which is all it can.
 
-Steady state is the time from the first finished submission to the last, per submission; for the kit, which executes
-first and then enters the marks, it is the sum of both parts. The whole process includes all imports. ``--feedback``
-lets the kit write the students' pages too, which stock ``autograde`` does not.
+Steady state is the time from the first submission whose marks are in the gradebook to the last, per submission (for the
+kit on two cores: from the second, as the first two end with the imports still under way). The whole process includes
+all imports. ``--feedback`` lets the kit write the students' pages too, which stock ``autograde`` does not.
 """
 
 from __future__ import annotations
@@ -114,35 +114,32 @@ def kit_main(base: Path, lab: str, feedback: bool) -> None:
     from robotbrain.grading.entry import Entry
 
     jobs = scheduler.fitting_workers()  # as without --jobs, on the cores that this process may use
-    executed: list[float] = []
     entered: list[float] = []
+    entering: list[float] = []
     enter = Entry.enter
 
     def enter_and_note(self: Entry, person: Any) -> bool:
+        began = time.perf_counter()
         try:
             return enter(self, person)
         finally:
             entered.append(time.perf_counter())
+            entering.append(entered[-1] - began)
 
-    shutil.rmtree(base / "kit" / lab / ".executed" / "entered", ignore_errors=True)  # or there is nothing to enter
+    shutil.rmtree(base / "kit" / lab, ignore_errors=True)  # or there is nothing to enter
     Entry.enter = enter_and_note  # type: ignore[method-assign]
-    options = classroom.Options(workers=jobs, fresh=True, require_sandbox=True, feedback=feedback)
     classroom.grade_class(
         find_course(REPOSITORY),
         lab,
         submitted=base / "in" / lab,
         out=base / "kit" / lab,
-        options=options,
-        progress=lambda *_: executed.append(time.perf_counter()),
+        options=classroom.Options(workers=jobs, fresh=True, require_sandbox=True, feedback=feedback),
     )
-    end = time.perf_counter()
-    pages = (end - entered[-1]) / len(entered) if feedback else 0.0
-    first = min(jobs, len(executed) - 1)  # these ended with the imports still under way
-    parts = [
-        (executed[-1] - executed[first - 1]) / (len(executed) - first),
-        (entered[-1] - entered[0]) / (len(entered) - 1),
-    ]
-    (base / "times.json").write_text(json.dumps({"steady": sum(parts) + pages, "parts": [*parts, pages]}))
+    pages = (time.perf_counter() - entered[-1]) / len(entered) if feedback else 0.0
+    first = min(jobs, len(entered) - 1)
+    steady = (entered[-1] - entered[first - 1]) / (len(entered) - first)
+    parts = {"steady": steady + pages, "entering": statistics.mean(entering), "pages": pages}
+    (base / "times.json").write_text(json.dumps(parts))
 
 
 def scores(root: Path, lab: str) -> dict[str, float]:
@@ -196,10 +193,10 @@ def main() -> int:
                     wrong |= set(differences(lab, stock["scores"], kit["scores"]))
                     for kind, (a, b) in sums.items():
                         sums[kind] = [a + stock[kind], b + kit[kind]]
-                    parts = ", ".join(f"{1000 * p:.0f}" for p in kit["parts"])
+                    parts = ", ".join(f"{name} {1000 * kit[name]:.0f}" for name in ("entering", "pages"))
                     print(
                         f"{cores} core(s), round {number + 1}, {lab}: per submission stock {stock['steady']:.2f} s, "
-                        f"kit {kit['steady']:.3f} s (run, enter, pages: {parts} ms); "
+                        f"kit {kit['steady']:.3f} s (of that, ms: {parts}); "
                         f"whole {stock['whole']:.1f} and {kit['whole']:.1f} s",
                         flush=True,
                     )

@@ -87,8 +87,9 @@ def grade_class(
     """Grade all submissions of ``lab``.
 
     Each submission runs in a process of its own, and its outcome is kept the moment it ends: a run that is stopped or
-    killed goes on where it was when started again. Once all have run, the marks are entered in the gradebook, one
-    transaction per student. Submissions already executed with the same tests are not run again.
+    killed goes on where it was when started again. Submissions already executed with the same tests are not run again.
+    Marks are entered in the gradebook while others still run, one transaction per student; students who have marks
+    run first, and where any of these would change, nothing is entered before all have run and ``confirm`` agrees.
 
     Args:
         submitted: folder with ``<student>/<lab>/`` in it; default: the course's own.
@@ -125,6 +126,63 @@ def _settled_heap() -> Iterator[None]:
         gc.unfreeze()
 
 
+class _Registrar:
+    """Takes people whose notebooks have run, and enters their marks as soon as that cannot need anybody's agreement.
+
+    That is when all who had marks before have run, and none of these would change.
+
+    Args:
+        students: everybody who will come.
+        hold: enter nothing until :meth:`enter_rest`.
+
+    Attributes:
+        marked: who had marks before.
+    """
+
+    def __init__(self, entry: Entry, students: Sequence[str], *, hold: bool) -> None:
+        self._entry, self._hold = entry, hold
+        self.marked = frozenset(s for s in students if entry.standing(s).marked)
+        self._awaited, self._here = set(self.marked), list[Person]()
+        self._changes: list[Change] | None = None
+        self._failed: list[str] = []
+
+    def may_enter(self, person: Person) -> bool:
+        """Whether the outcome may be entered: a failure of the machine writes over no mark that is there."""
+        return _sound(person) or person.student not in self.marked
+
+    def hand_in(self, person: Person) -> None:
+        """Take a person, and enter all who are here if it is time."""
+        self._awaited.discard(person.student)
+        if self.may_enter(person):
+            self._here.append(person)
+        if self._awaited or self._hold:
+            return
+        try:
+            if self.changes:
+                self._hold = True
+            else:
+                self.enter_rest()
+        except Exception:  # what ails the gradebook need not keep the others from being run; at the end it is told
+            self._entry.writer.log.exception("entering marks was put off")
+            self._hold = True
+
+    @property
+    def changes(self) -> list[Change]:
+        """What entering those with marks would change, once all of them are here."""
+        if self._changes is None:
+            found = (self._entry.change(p) for p in self._here)
+            self._changes = sorted(filter(None, found), key=lambda c: c.student)
+        return self._changes
+
+    def enter_rest(self) -> list[str]:
+        """Enter everybody who is here and has not been entered; return all who could not be."""
+        while self._here:
+            if not self._entry.enter(self._here[0]):
+                self._failed.append(self._here[0].student)
+            del self._here[0]
+        return self._failed
+
+
 class _Run:
     """One grading run, with everything its steps share."""
 
@@ -156,12 +214,14 @@ class _Run:
             writer = stack.enter_context(self._writer())
             entry = Entry(writer, journal, self.kept / "entered" / self.lab)
             stack.enter_context(_settled_heap())
-            people = self._execute([*students, *self._absent(entry, students)], journal, bench, progress)
-            people, rows = self._postpone(entry, people), Rows(journal, people)
-            changes = [c for p in people if (c := entry.change(p))]
+            everybody = [*students, *self._absent(entry, students)]
+            registrar = _Registrar(entry, everybody, hold=self.options.dry_run)
+            people = self._execute(everybody, journal, bench, registrar, progress)
+            people, rows = self._postpone(registrar, people), Rows(journal, people)
+            changes = registrar.changes
             if self.options.dry_run or (changes and confirm is not None and not confirm(changes)):
                 return self._result(rows, changes, entered=False)
-            rows = rows.failed([p.student for p in people if not entry.enter(p)])
+            rows = rows.failed(registrar.enter_rest())
             if self.options.feedback:
                 self._feedback(entry, people, rows)
         result = self._result(rows, changes, entered=True)
@@ -192,35 +252,49 @@ class _Run:
         return [s for s in others if entry.was_missing(s) or not entry.standing(s).marked]
 
     def _execute(
-        self, students: list[str], journal: jobs.Journal, bench: jobs.Bench, progress: Progress | None
+        self,
+        students: list[str],
+        journal: jobs.Journal,
+        bench: jobs.Bench,
+        registrar: _Registrar,
+        progress: Progress | None,
     ) -> list[Person]:
+        """Run everybody's notebooks; return the outcomes in the order of ``students``."""
         tasks = roster.tasks(self.folder, self.lab, self.sources, students)
+        groups = itertools.groupby(tasks, key=lambda t: (t.student, t.folder))
+        own = {student: (folder, list(group)) for (student, folder), group in groups}
         found: dict[tuple[str, str], jobs.Done] = {}
+
+        def person(student: str) -> Person:
+            folder, notebooks = own[student]
+            return Person(student, folder, [found[student, t.notebook] for t in notebooks])
 
         def consume(done: jobs.Done) -> None:
             found[done.student, done.notebook] = done
             if progress is not None:
                 progress(len(found), len(tasks), done.student)
+            if all((done.student, t.notebook) in found for t in own[done.student][1]):
+                registrar.hand_in(person(done.student))
 
         def work(task: jobs.Task) -> jobs.Done:
             return jobs.grade(self.course, task, journal, bench, fresh=self.options.fresh)
 
         try:
             workers = max(self.options.workers, getattr(bench, "slots", 1))
-            scheduler.run(tasks, work, consume, workers=workers, stop=bench.close)
+            ordered = sorted(tasks, key=lambda t: t.student not in registrar.marked)
+            scheduler.run(ordered, work, consume, workers=workers, stop=bench.close)
         except KeyboardInterrupt:
             self.say(f"Stopped. {len(found)} of {len(tasks)} submissions are done and kept; the same command goes on.")
             raise
-        groups = itertools.groupby(tasks, key=lambda t: (t.student, t.folder))
-        return [Person(s, folder, [found[t.student, t.notebook] for t in own]) for (s, folder), own in groups]
+        return [person(student) for student in own]
 
-    def _postpone(self, entry: Entry, people: Sequence[Person]) -> list[Person]:
+    def _postpone(self, registrar: _Registrar, people: Sequence[Person]) -> list[Person]:
         """Those whose marks are to be entered: a failure of the machine writes over no mark that is there."""
-        unsound = {p.student for p in people if not all(d.sound for d in p.done)}
+        unsound = sorted(p.student for p in people if not _sound(p))
         if unsound:
-            names = ", ".join(sorted(unsound)[:10]) + ("…" if len(unsound) > 10 else "")
+            names = ", ".join(unsound[:10]) + ("…" if len(unsound) > 10 else "")
             self.say(f"{len(unsound)} submissions could not be run ({names}); the same command tries them again.")
-        return [p for p in people if p.student not in unsound or not entry.standing(p.student).marked]
+        return [p for p in people if registrar.may_enter(p)]
 
     def _feedback(self, entry: Entry, people: Sequence[Person], rows: Rows) -> None:
         """Write the pages of those for whom anything has changed."""
@@ -259,6 +333,10 @@ def open_bench(course: Course, lab: str, options: Options) -> Any:
     from robotbrain.grading.bench import Bench
 
     return Bench(course.autograder, require_sandbox=options.require_sandbox, limits=options.limits, preload_labs=[lab])
+
+
+def _sound(person: Person) -> bool:
+    return all(done.sound for done in person.done)
 
 
 def _sweep(*folders: Path) -> None:
