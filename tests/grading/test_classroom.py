@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import json
@@ -9,17 +10,19 @@ import os
 import re
 import shutil
 import sqlite3
+import time
 from argparse import ArgumentParser
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from nbgrader.api import Gradebook
+from nbgrader.api import Gradebook, MissingEntry
 
 from robotbrain.errors import InputError
 from robotbrain.grading import backups, classroom, commands, course, jobs, mutation, sample
 from robotbrain.grading.changes import Change, changes_text
+from robotbrain.grading.entry import Entry, Person
 from robotbrain.grading.execute import Limits
 from robotbrain.grading.marks import Mark, Marks, csv_text, table
 from tests.grading import toylab
@@ -339,6 +342,56 @@ def test_marks_go_down_only_if_a_person_agrees(
     assert re.search(rf"^bilal +7.5 +{15 * earned:g} ", capsys.readouterr().err, re.MULTILINE)
     after = {"amara": 15.0, "bilal": 15.0 * earned, "chen": 15.0}
     assert room.scores() == (after if code == 0 else {"amara": 15.0, "bilal": 7.5})
+
+
+def test_marks_are_entered_while_others_still_run(room: Room) -> None:
+    room.submit("chen", 1.0)
+    seen: dict[str, float] = {}
+
+    def wait_for_marks(student: str) -> None:
+        limit = time.monotonic() + 60
+        while student == "chen" and "amara" not in seen and time.monotonic() < limit:
+            with contextlib.suppress(MissingEntry):  # not one mark yet
+                seen.update(room.scores())
+
+    room.bench = FakeBench(wait_for_marks)
+    room.grade()
+    assert seen["amara"] == 15.0 and "chen" not in seen
+    assert room.scores() == {"amara": 15.0, "bilal": 7.5, "chen": 15.0}
+
+
+def test_where_marks_would_change_nothing_is_entered_before_somebody_agrees(room: Room) -> None:
+    room.grade()
+    room.submit("aaron", 1.0)
+    room.submit("bilal", 0.0)
+    asked: list[dict[str, float]] = []
+
+    def confirm(changes: list[Change]) -> bool:
+        assert [c.student for c in changes] == ["bilal"]
+        asked.append(room.scores())
+        return True
+
+    result = room.grade(confirm=confirm)
+    assert room.bench.ran == ["bilal", "aaron"]  # those who have marks come first
+    assert asked == [{"amara": 15.0, "bilal": 7.5}]
+    assert room.scores() == {"aaron": 15.0, "amara": 15.0, "bilal": 0.0}
+    assert [row.student for row in result.rows] == ["aaron", "amara", "bilal"]
+
+
+def test_a_gradebook_that_fails_meanwhile_does_not_stop_the_others(room: Room, monkeypatch: pytest.MonkeyPatch) -> None:
+    room.submit("chen", 1.0)
+    enter, failed = Entry.enter, list[str]()
+
+    def fail_once(self: Entry, person: Person) -> bool:
+        if not failed:
+            failed.append(person.student)
+            raise OSError("no space left on device")
+        return enter(self, person)
+
+    monkeypatch.setattr(Entry, "enter", fail_once)
+    room.grade()
+    assert failed == ["amara"] and room.bench.ran == ["amara", "bilal", "chen"]
+    assert room.scores() == {"amara": 15.0, "bilal": 7.5, "chen": 15.0}
 
 
 def test_new_marks_need_no_agreement(room: Room, capsys: pytest.CaptureFixture[str]) -> None:
