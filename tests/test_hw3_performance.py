@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ from robotbrain.pipeline.inherited import (
     unmet_requirements,
     whole_map_planner,
 )
+from robotbrain.ros import charge_work
 from tests import classes
 
 LAB = "hw3_performance"
@@ -165,32 +167,109 @@ def setup_of(key: drives.Key) -> tuple[BrainSetup, int, float]:
 class OneThread:
     """A student whose planner is their own, and whose nodes all share a thread."""
 
-    def __init__(self, setup: BrainSetup) -> None:
-        self.setup, self.hosted = setup, False
+    def __init__(self, setup: BrainSetup, planner: Callable[[], Any] = cropped_planner) -> None:
+        self.setup, self.planner = setup, planner
 
     def __getitem__(self, name: str) -> object:
         return None
 
     def run(self, probe: Callable[..., Any], module: str) -> Any:
         if probe is drives.host_repaired:
-            self.hosted = True
-            return drives.PlannerHost(cropped_planner)
+            return drives.PlannerHost(self.planner)
         deployment = {f.name: getattr(self.setup.deployment, f.name) for f in fields(self.setup.deployment)}
         there = {"module": module or self.setup.module, "replan_after": self.setup.replan_after}
         return {"deployment": deployment, "planner": "", **there}
 
 
-def test_a_planner_of_ones_own_on_one_thread_drives_wherever_it_may_earn_points(suite: Suite) -> None:
+@pytest.fixture
+def counted(monkeypatch: pytest.MonkeyPatch) -> list[BrainSetup]:
+    """The brains that drive."""
+    drove: list[BrainSetup] = []
+    drive = BrainSetup.drive
+
+    def noted(self: BrainSetup, *args: Any, **kwargs: Any) -> Any:
+        drove.append(self)
+        return drive(self, *args, **kwargs)
+
+    monkeypatch.setattr(BrainSetup, "drive", noted)
+    return drove
+
+
+def on_one_thread(**changes: Any) -> BrainSetup:
     given = inherited_brain()
     deployment = replace(given.deployment, image_size=(640, 480), precision="int8", camera_queue=1)
-    student = OneThread(replace(given, deployment=deployment))
-    found = drives.drive_repaired(student, 3, drives.NX, time_limit=4.0)  # type: ignore[arg-type]
-    assert not student.hosted and found.e2e_p95_ms > drives.HALF_BUDGETS * drives.BUDGET_MS[drives.NX]
-    found = drives.drive_repaired(student, 1)  # type: ignore[arg-type]
-    assert student.hosted and found.e2e_p95_ms <= drives.BUDGET_MS[drives.NANO]
-    near = OneThread(replace(given, deployment=deployment, replan_after=1.0))  # another planner might come below it
+    return replace(given, deployment=deployment, **changes)
+
+
+def charging(work: Mapping[str, float], on_map: bool = False) -> Callable[[], Any]:
+    """A planner that plans like the kit's and charges more."""
+
+    def make() -> Any:
+        from robotbrain.pipeline.nodes.planner import PlannerNode
+
+        class Dear(PlannerNode):
+            def _on_map(self, msg: Any) -> None:
+                super()._on_map(msg)
+                self.charge(on_map)
+
+            def _plan(self, request: Any, response: Any) -> Any:
+                self.charge(not on_map)
+                return super()._plan(request, response)
+
+            def charge(self, now: bool) -> None:
+                for kind, units in work.items() if now else ():
+                    charge_work(kind, units)
+
+        return Dear()
+
+    return make
+
+
+def test_a_planner_of_ones_own_on_one_thread_drives_wherever_it_decides(
+    suite: Suite, counted: list[BrainSetup]
+) -> None:
+    hopeless = drives.drive_repaired(OneThread(on_one_thread()), 3, drives.NX, time_limit=4.0)  # type: ignore[arg-type]
+    assert hopeless.e2e_p95_ms > drives.HALF_BUDGETS * drives.BUDGET_MS[drives.NX]
+    assert counted == []
+    near = OneThread(on_one_thread(replan_after=1.0))  # another planner might come below it
     drives.drive_repaired(near, 3, drives.NX, time_limit=4.0)  # type: ignore[arg-type]
-    assert near.hosted
+    assert len(counted) == 1
+
+
+@pytest.mark.parametrize("world", [1, 4])
+def test_a_planner_on_one_thread_that_takes_no_longer_than_the_kits_need_not_drive(
+    suite: Suite, counted: list[BrainSetup], monkeypatch: pytest.MonkeyPatch, world: int
+) -> None:
+    student = OneThread(on_one_thread())
+    found = drives.drive_repaired(student, world)  # type: ignore[arg-type]
+    assert counted == [] and found.success and found.e2e_p95_ms <= drives.BUDGET_MS[drives.NANO]
+    monkeypatch.setattr(drives, "KNOWN", {})
+    driven = drives.drive_repaired(student, world)  # type: ignore[arg-type]
+    assert len(counted) == 1 and driven.success
+    assert driven.e2e_p95_ms == pytest.approx(found.e2e_p95_ms, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("dear", "late"),
+    [
+        (charging({"astar": 30_000}), True),
+        (charging({"astar": 30_000}, on_map=True), True),
+        (charging({"view": 1}), False),  # of a kind that no planner has
+    ],
+    ids=["answers", "maps", "another-kind"],
+)
+def test_a_planner_on_one_thread_that_takes_longer_drives(
+    suite: Suite, counted: list[BrainSetup], dear: Callable[[], Any], late: bool
+) -> None:
+    found = drives.drive_repaired(OneThread(on_one_thread(), dear), 1)  # type: ignore[arg-type]
+    assert len(counted) == 1 and (found.e2e_p95_ms > 1.2 * drives.BUDGET_MS[drives.NANO]) == late
+
+
+@pytest.mark.parametrize("work", [{"astar": math.nan}, {"astar": -1e9, "costmap": 1e9}, {"astar": math.inf}])
+def test_charges_that_are_no_charges_are_not_compared(work: dict[str, float]) -> None:
+    fair = [{"astar": 100.0, "costmap": 100.0}] * 2
+    assert drives._never_more(fair, fair, drives.NANO)
+    assert not drives._never_more([work, {}], fair, drives.NANO)
 
 
 def test_requirements_name_what_is_broken() -> None:

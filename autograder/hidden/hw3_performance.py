@@ -385,3 +385,6 @@ def make_recordings():
     for cause, alone in PLANTED:
         for which in range(PIPELINES):
             _pipeline(cause, alone, which)
+
+
+suite.warm(drives.warm_charges)

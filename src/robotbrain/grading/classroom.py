@@ -158,9 +158,7 @@ class _Registrar:
         if self._awaited or self._hold:
             return
         try:
-            if self.changes:
-                self._hold = True
-            else:
+            if not self.changes:
                 self.enter_rest()
         except Exception:  # what ails the gradebook need not keep the others from being run; at the end it is told
             self._entry.writer.log.exception("entering marks was put off")

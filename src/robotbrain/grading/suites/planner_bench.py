@@ -7,7 +7,7 @@ with the tests and sends it maps and requests. Rooms are small and coarse, so th
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -97,9 +97,9 @@ class PlannerBench:
         student[name]  # a class that is missing is reported before anything else
         return cls(_call(lambda: student.run(host, name)))
 
-    def show(self, room: Room) -> None:
-        """Publish a map."""
-        _call(lambda: self._host.show(*room))
+    def show(self, room: Room) -> dict[str, float]:
+        """Publish a map; return what the node charged for it, by kind of work."""
+        return _plain(_call(lambda: self._host.show(*room)))
 
     def ask(self, start: Point, goal: Point, tolerance: float = 0.3) -> Array:
         """Return the answered path, (N, 2) m."""
@@ -110,7 +110,7 @@ class PlannerBench:
             hint="return-response",
             expected="the response, with its plan filled in",
         )
-        self.work = {str(kind): float(units) for kind, units in work.items()}
+        self.work = _plain(work)
         for kind, units in self.work.items():
             self.most_work[kind] = max(units, self.most_work.get(kind, 0.0))
         points = as_numbers(path)
@@ -118,6 +118,10 @@ class PlannerBench:
             fail("the answered path is no list of finite points", got=path, expected="finite points (x, y)")
         assert points is not None
         return points
+
+
+def _plain(work: Mapping[Any, Any]) -> dict[str, float]:
+    return {str(kind): float(units) for kind, units in work.items()}
 
 
 def _call(ask: Callable[[], Any]) -> Any:
