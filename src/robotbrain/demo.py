@@ -36,7 +36,7 @@ _KINDS = {"reference": "reference", "style": "right, in another style", "mutant"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of ``robotbrain demo``."""
     parser.add_argument("--out", type=Path, help="folder for the page (default: demo/ in the course folder)")
-    parser.add_argument("--jobs", type=int, help="submissions graded at the same time (default: one per core)")
+    parser.add_argument("--jobs", type=int, help="submissions graded at the same time (default: one per core, and one)")
     parser.add_argument("--fresh", action="store_true", help="grade everything again, also what has not changed")
 
 

@@ -68,7 +68,7 @@ def grade_class_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("lab")
     parser.add_argument("--submitted", type=Path, metavar="DIR", help="folder with <student>/<lab>/ in it")
     parser.add_argument(
-        "--jobs", type=int, metavar="N", help="submissions that run at the same time (default: one per core)"
+        "--jobs", type=int, metavar="N", help="submissions that run at the same time (default: one per core, and one)"
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="grade into a folder of its own, not the gradebook")
     parser.add_argument(

@@ -23,11 +23,13 @@ def usable_cores() -> int:
 
 
 def fitting_workers() -> int:
-    """How many submissions to run at the same time here: one per core, as far as memory allows.
+    """How many submissions to run at the same time here: one per core and one more, as far as memory allows.
 
-    More per core bring nothing: the processes of one submission seldom wait, and those of two fight for the cache.
+    The one more runs while others start, end or wait for the gradebook: a tenth of the time, measured on two cores. On
+    a single core nothing ever waits, and two submissions fight for the cache.
     """
-    return max(1, min(usable_cores(), int(psutil.virtual_memory().available // _MEMORY_BYTES)))
+    cores = usable_cores()
+    return max(1, min(cores + (cores > 1), int(psutil.virtual_memory().available // _MEMORY_BYTES)))
 
 
 def run(
