@@ -66,7 +66,7 @@ class Entry:
         self._path(person.student).unlink(missing_ok=True)
         try:
             executed = {d.notebook: self.journal.executed(d.key) for d in person.done}
-            self.writer.enter(person.student, person.folder, executed)
+            late_s = self.writer.enter(person.student, person.folder, executed)
         except Exception:  # whatever nbgrader stumbles over costs this student's marks, not the class
             self.writer.log.exception("%s could not be entered", person.student)
             self.writer.enter_zero(person.student, person.folder)
@@ -76,7 +76,7 @@ class Entry:
             "submissions": [d.submission for d in person.done],
             "environment": self.journal.environment,
             "missing": person.folder is None,
-            "late_s": self.standing(person.student).late_s,
+            "late_s": late_s,
         }
         self._keep(person.student, note)
         return True

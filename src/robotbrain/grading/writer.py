@@ -74,26 +74,30 @@ class Writer:
         """Where the autograded notebooks of ``student`` lie."""
         return Path(self._directory.format_path(self.course.autograded, student, self.lab))
 
-    def enter(self, student: str, submitted: Path | None, executed: Mapping[str, Path]) -> None:
+    def enter(self, student: str, submitted: Path | None, executed: Mapping[str, Path]) -> float:
         """Write one student's grades and autograded files, replacing those of an earlier run; all or nothing.
 
         Args:
             submitted: the submission's folder, or None if nothing was handed in.
             executed: name of a notebook (without ``.ipynb``) -> its executed, healed version.
+
+        Returns:
+            Seconds past the due date, as nbgrader counts them now.
         """
         self._directory.student_id = student  # for hooks that look there
         self._converter.notebooks = [str(self.folder(student) / f"{name}.ipynb") for name in executed]
         received = jobs.received(self.course, submitted)
 
-        def step() -> None:
+        def step() -> float:
             self._converter.run_pre_convert_hook()
-            self.gradebook.begin(self.lab, student, submitted_at(received))
+            submission = self.gradebook.begin(self.lab, student, submitted_at(received))
             with shared(self.gradebook, [*self._before, *self._after]):
                 made = {f"{name}.ipynb": self._convert(student, name, path) for name, path in executed.items()}
             self._publish(student, received, made)
             self._converter.run_post_convert_hook()
+            return float(submission.total_seconds_late)
 
-        self.gradebook.transact(step)
+        return self.gradebook.transact(step)
 
     def enter_zero(self, student: str, submitted: Path | None) -> None:
         """Give a student whom nbgrader itself cannot grade an explicit zero; what people gave stays."""
