@@ -1,8 +1,9 @@
 """Drives of the brains that homework 3's repairs are likely to make, for grading to look up.
 
 Without the student's own planner a run depends on the deployment alone, and most students deploy alike. With it, and
-all on one thread, it hardly matters on the slower module: even one that takes no time leaves it too slow. Run this
-again when the pipeline, a profile or the simulation changes; tests/test_hw3_performance.py drives some of them again.
+all on one thread, it hardly matters on the slower module: even one that takes next to no time leaves it too slow. Run
+this again when the pipeline, a profile or the simulation changes; tests/test_hw3_performance.py drives some of them
+again.
 
     python benchmarks/repaired_drives.py autograder/reference/hw3_performance_drives.json
 """

@@ -24,6 +24,7 @@ from robotbrain.grading import backups, classroom, commands, course, jobs, mutat
 from robotbrain.grading.changes import Change, changes_text
 from robotbrain.grading.entry import Entry, Person
 from robotbrain.grading.execute import Limits
+from robotbrain.grading.gradebook import Standing
 from robotbrain.grading.marks import Mark, Marks, csv_text, table
 from tests.grading import toylab
 from tests.grading.fakebench import FakeBench, answers
@@ -351,6 +352,7 @@ def test_marks_are_entered_while_others_still_run(room: Room) -> None:
     def wait_for_marks(student: str) -> None:
         limit = time.monotonic() + 60
         while student == "chen" and "amara" not in seen and time.monotonic() < limit:
+            time.sleep(0.01)
             with contextlib.suppress(MissingEntry):  # not one mark yet
                 seen.update(room.scores())
 
@@ -382,16 +384,52 @@ def test_a_gradebook_that_fails_meanwhile_does_not_stop_the_others(room: Room, m
     room.submit("chen", 1.0)
     enter, failed = Entry.enter, list[str]()
 
-    def fail_once(self: Entry, person: Person) -> bool:
+    def fail_once(self: Entry, person: Person, standing: Standing) -> bool:
         if not failed:
             failed.append(person.student)
             raise OSError("no space left on device")
-        return enter(self, person)
+        return enter(self, person, standing)
 
     monkeypatch.setattr(Entry, "enter", fail_once)
     room.grade()
     assert failed == ["amara"] and room.bench.ran == ["amara", "bilal", "chen"]
     assert room.scores() == {"amara": 15.0, "bilal": 7.5, "chen": 15.0}
+
+
+def test_a_mark_that_somebody_gives_meanwhile_is_not_written_over_unasked(room: Room) -> None:
+    room.submit("chen", 0.0)
+    other = Room(room.root)  # with a bench of its own
+    asked: list[list[Change]] = []
+
+    def grade_elsewhere(student: str) -> None:
+        if student == "chen":
+            with Gradebook(room.url) as gradebook:
+                gradebook.update_or_create_student("chen")
+                gradebook.update_or_create_submission("toy", "chen")
+                gradebook.find_grade("score-mean", "toy", "toy", "chen").manual_score = 4.0
+                gradebook.find_grade("score-scale", "toy", "toy", "chen").auto_score = 5.0
+                gradebook.db.commit()
+
+    room.bench = FakeBench(grade_elsewhere)
+    room.grade(confirm=lambda changes: bool(asked.append(changes)))
+    assert [(c.student, c.before, c.after) for c in asked[0]] == [("chen", 9.0, 4.0)]
+    assert other.scores()["chen"] == 9.0
+
+
+def test_limits_in_wall_time_stretch_where_submissions_share_a_core(
+    room: Room, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scales: list[str] = []
+    room.bench = FakeBench(lambda _: scales.append(os.environ["ROBOTBRAIN_TIME_SCALE"]))
+    monkeypatch.setattr(classroom.scheduler, "usable_cores", lambda: 2)
+    monkeypatch.setenv("ROBOTBRAIN_TIME_SCALE", "2")
+    room.grade(workers=3)
+    room.grade(options=classroom.Options(workers=1, fresh=True))
+    assert scales == ["3.0"] * 2 + ["2.0"] * 2
+    assert os.environ["ROBOTBRAIN_TIME_SCALE"] == "2"
+    monkeypatch.delenv("ROBOTBRAIN_TIME_SCALE")
+    room.grade(options=classroom.Options(workers=2, fresh=True))
+    assert scales[4:] == ["1.0"] * 2 and "ROBOTBRAIN_TIME_SCALE" not in os.environ
 
 
 def test_new_marks_need_no_agreement(room: Room, capsys: pytest.CaptureFixture[str]) -> None:

@@ -20,10 +20,11 @@ from robotbrain.grading.classresult import ClassResult, Rows, feedback_page, wri
 from robotbrain.grading.course import CONFIG_NAME, Course, generate
 from robotbrain.grading.entry import Entry, Person
 from robotbrain.grading.execute import Limits
-from robotbrain.grading.gradebook import wait_until_free
+from robotbrain.grading.gradebook import Standing, wait_until_free
 from robotbrain.grading.lock import only_run
 from robotbrain.grading.marks import Marks, marks_of
 from robotbrain.grading.reports.feedback import write_feedback
+from robotbrain.grading.runner import TIME_SCALE_VARIABLE, time_scale
 from robotbrain.grading.suite import AUTOGRADER_VARIABLE
 from robotbrain.grading.writer import Writer, student_ids
 
@@ -126,10 +127,25 @@ def _settled_heap() -> Iterator[None]:
         gc.unfreeze()
 
 
+@contextlib.contextmanager
+def _stretched_limits(workers: int) -> Iterator[None]:
+    """Give tests more time where more submissions run than there are cores: their limits are in wall time."""
+    before = os.environ.get(TIME_SCALE_VARIABLE)
+    os.environ[TIME_SCALE_VARIABLE] = str(time_scale() * max(1.0, workers / scheduler.usable_cores()))
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[TIME_SCALE_VARIABLE]
+        else:
+            os.environ[TIME_SCALE_VARIABLE] = before
+
+
 class _Registrar:
     """Takes people whose notebooks have run, and enters their marks as soon as that cannot need anybody's agreement.
 
-    That is when all who had marks before have run, and none of these would change.
+    That is when all who had marks before have run, and none of these would change. A failure of the machine waits for
+    the end, and writes over no mark that is there.
 
     Args:
         students: everybody who will come.
@@ -142,43 +158,52 @@ class _Registrar:
     def __init__(self, entry: Entry, students: Sequence[str], *, hold: bool) -> None:
         self._entry, self._hold = entry, hold
         self.marked = frozenset(s for s in students if entry.standing(s).marked)
-        self._awaited, self._here = set(self.marked), list[Person]()
-        self._changes: list[Change] | None = None
+        self._awaited, self._here, self._unsound = set(self.marked), list[Person](), list[Person]()
         self._failed: list[str] = []
-
-    def may_enter(self, person: Person) -> bool:
-        """Whether the outcome may be entered: a failure of the machine writes over no mark that is there."""
-        return _sound(person) or person.student not in self.marked
 
     def hand_in(self, person: Person) -> None:
         """Take a person, and enter all who are here if it is time."""
         self._awaited.discard(person.student)
-        if self.may_enter(person):
-            self._here.append(person)
+        (self._here if all(done.sound for done in person.done) else self._unsound).append(person)
         if self._awaited or self._hold:
             return
         try:
-            if not self.changes:
-                self.enter_rest()
+            standings = self._standings(self._here)
+            self._hold = bool(self._changes(standings))
+            if not self._hold:
+                self._enter(self._here, standings)
         except Exception:  # what ails the gradebook need not keep the others from being run; at the end it is told
             self._entry.writer.log.exception("entering marks was put off")
             self._hold = True
 
-    @property
     def changes(self) -> list[Change]:
-        """What entering those with marks would change, once all of them are here."""
-        if self._changes is None:
-            found = (self._entry.change(p) for p in self._here)
-            self._changes = sorted(filter(None, found), key=lambda c: c.student)
-        return self._changes
+        """What entering those who are here would change now: somebody may have given marks meanwhile."""
+        return self._changes(self._standings(self._here))
+
+    def postponed(self) -> tuple[list[str], set[str]]:
+        """Whose notebooks the machine failed to run, and who of them keeps the marks they have."""
+        unsound = sorted(p.student for p in self._unsound)
+        return unsound, {s for s in unsound if self._entry.standing(s).marked}
 
     def enter_rest(self) -> list[str]:
-        """Enter everybody who is here and has not been entered; return all who could not be."""
-        while self._here:
-            if not self._entry.enter(self._here[0]):
-                self._failed.append(self._here[0].student)
-            del self._here[0]
+        """Enter everybody who has not been entered yet; return all who could not be."""
+        _, kept = self.postponed()
+        self._here += [p for p in self._unsound if p.student not in kept]
+        self._enter(self._here, self._standings(self._here))
         return self._failed
+
+    def _standings(self, people: Sequence[Person]) -> list[Standing]:
+        return [self._entry.standing(p.student) for p in people]
+
+    def _changes(self, standings: Sequence[Standing]) -> list[Change]:
+        found = (self._entry.change(p, s) for p, s in zip(self._here, standings, strict=True))
+        return sorted(filter(None, found), key=lambda c: c.student)
+
+    def _enter(self, people: list[Person], standings: Sequence[Standing]) -> None:
+        for standing in standings:
+            if not self._entry.enter(people[0], standing):
+                self._failed.append(people[0].student)
+            del people[0]
 
 
 class _Run:
@@ -207,6 +232,7 @@ class _Run:
             backups.backup(self.course.gradebook_url, self.course.results / "backups")
             generate(self.course, self.lab, log=self.log)
         with contextlib.ExitStack() as stack:
+            stack.enter_context(_stretched_limits(self.options.workers))
             bench = stack.enter_context(open_bench(self.course, self.lab, self.options))
             journal = self._journal(bench)
             writer = stack.enter_context(self._writer())
@@ -216,7 +242,7 @@ class _Run:
             registrar = _Registrar(entry, everybody, hold=self.options.dry_run)
             people = self._execute(everybody, journal, bench, registrar, progress)
             people, rows = self._postpone(registrar, people), Rows(journal, people)
-            changes = registrar.changes
+            changes = registrar.changes()
             if self.options.dry_run or (changes and confirm is not None and not confirm(changes)):
                 return self._result(rows, changes, entered=False)
             rows = rows.failed(registrar.enter_rest())
@@ -288,11 +314,11 @@ class _Run:
 
     def _postpone(self, registrar: _Registrar, people: Sequence[Person]) -> list[Person]:
         """Those whose marks are to be entered: a failure of the machine writes over no mark that is there."""
-        unsound = sorted(p.student for p in people if not _sound(p))
+        unsound, kept = registrar.postponed()
         if unsound:
             names = ", ".join(unsound[:10]) + ("…" if len(unsound) > 10 else "")
             self.say(f"{len(unsound)} submissions could not be run ({names}); the same command tries them again.")
-        return [p for p in people if registrar.may_enter(p)]
+        return [p for p in people if p.student not in kept]
 
     def _feedback(self, entry: Entry, people: Sequence[Person], rows: Rows) -> None:
         """Write the pages of those for whom anything has changed."""
@@ -331,10 +357,6 @@ def open_bench(course: Course, lab: str, options: Options) -> Any:
     from robotbrain.grading.bench import Bench
 
     return Bench(course.autograder, require_sandbox=options.require_sandbox, limits=options.limits, preload_labs=[lab])
-
-
-def _sound(person: Person) -> bool:
-    return all(done.sound for done in person.done)
 
 
 def _sweep(*folders: Path) -> None:

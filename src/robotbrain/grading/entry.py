@@ -50,14 +50,13 @@ class Entry:
         """Whether the marks in the gradebook are those of a submission that was not there."""
         return bool(self._note(student).get("missing"))
 
-    def change(self, person: Person) -> Change | None:
-        """What entering ``person`` would change."""
-        before = self.standing(person.student)
+    def change(self, person: Person, before: Standing) -> Change | None:
+        """What entering ``person`` would change, who stands as ``before``."""
         return change(person.student, before, expected(before, _scores(person)), self._why(person))
 
-    def enter(self, person: Person) -> bool:
-        """Write a student's marks unless they are there already; return whether they could be entered."""
-        note, standing = self._note(person.student), self.standing(person.student)
+    def enter(self, person: Person, standing: Standing) -> bool:
+        """Write the marks of a student who has this standing, unless they are there; return whether that went well."""
+        note = self._note(person.student)
         keys = [d.key for d in person.done]
         there = standing == expected(standing, _scores(person)) and standing.late_s == note.get("late_s")
         files = all((self.writer.folder(person.student) / f"{d.notebook}.ipynb").is_file() for d in person.done)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from robotbrain.grading import CheckFailure, expect, fail
+from robotbrain.grading import expect, fail
 from robotbrain.grading.suites.hw3_performance_probes import describe_repair, host_repaired
 from robotbrain.grading.suites.hw3_performance_verdict import p95
 from robotbrain.grading.suites.planner_bench import (
@@ -43,8 +43,9 @@ BUDGET_MS = {NANO: 130.0, NX: 180.0}
 HALF_BUDGETS = 1.5
 """Half of the points are for a latency of at most so many budgets."""
 
-SPREAD = 1.2
-"""By how much the latencies of one deployment on one thread differ between planners, at the most."""
+SPREAD = 1.15
+"""How many times as long as with the kit's planners the latency of a deployment on one thread may be, or the kit's as
+long as with another, at the most; 1.09 was seen where a queue holds one image."""
 
 TIME_LIMIT = 10.0
 """Of a drive in an easy world, s; a repaired brain takes half of it."""
@@ -226,8 +227,8 @@ def drive_repaired(student: Student, world: int, module: str = "", time_limit: f
 
     A planner that has a thread of its own delays neither perception nor control, so the kit's may drive in its place
     (:func:`check_planner` tries the student's). On one thread with all others it has to come along, unless the outcome
-    is known without it: the latency earns nothing with any of the kit's planners, one that takes no time among them, or
-    it is safely within the budget with one of them that takes at least the student's time for the same questions.
+    is known without it: the latency earns nothing with any of the kit's planners, one that takes next to no time among
+    them, or is safely within the budget with one of them that takes at least the student's time for the same questions.
     """
     from robotbrain.ros import CallbackError
 
@@ -261,16 +262,14 @@ def _known_on_one_thread(
     if best and len(known) == 3 and best.e2e_p95_ms > SPREAD * HALF_BUDGETS * budget:
         return best
     good = {p: run for p, run in known.items() if run.success and SPREAD * run.e2e_p95_ms <= budget}
-    good.pop(free_planner, None)  # less than nothing no planner charges
+    good.pop(free_planner, None)  # nobody charges less
     if not good:
         return None
     try:
         charged = _charges(PlannerBench(student.run(host_repaired, module)))
-    except CheckFailure:
-        return None  # on the way it shows what that means
-    return next(
-        (run for planner, run in good.items() if _never_more(charged, _charges_of(planner), setup.module)), None
-    )
+        return next((run for kits, run in good.items() if _never_more(charged, _charges_of(kits), setup.module)), None)
+    except Exception:  # whatever is wrong with this planner, its own drive shows
+        return None
 
 
 Charges = list[dict[str, float]]
@@ -282,11 +281,11 @@ def _charges(bench: PlannerBench) -> Charges:
     occupancy = np.full((440, 440), -1, dtype=np.int8)  # as large as the map of the brain, and known as far as the room
     occupancy[132:308, 132:308] = 100
     occupancy[133:307, 133:307] = 0
-    shown, answered = [], []
+    room, shown, answered = (occupancy, 0.05, (-11.0, -11.0)), [], []
     for along, goal in ((0.0, (1.11, -0.47)), (0.3, (1.07, -0.46)), (0.6, (1.03, -0.44)), (0.85, (1.12, -0.48))):
-        shown.append(bench.show((occupancy, 0.05, (-11.0, -11.0))))
-        path = bench.ask((along * goal[0], along * goal[1]), goal, tolerance=0.4)
-        expect(len(path) > 1, "the path is empty, but there is a route")
+        start = along * goal[0], along * goal[1]
+        shown.append(bench.show(room))
+        check_path(bench.ask(start, goal, tolerance=0.4), room, start, goal)
         answered.append(bench.work)
     return shown + answered
 
@@ -297,7 +296,10 @@ def _charges_of(planner: Callable[[], Any]) -> Charges:
 
 
 def _never_more(charges: Charges, others: Charges, module: str) -> bool:
-    """Tell whether ``charges`` come to no more time on a module than ``others``, each compared with its like."""
+    """Tell whether ``charges`` come to no more time on a module than ``others``, each compared with its like.
+
+    An answer that charges nothing has the time that is assumed of foreign code, which may be more.
+    """
     from robotbrain.jetson import load_profile
 
     profile, kinds = load_profile(module), {kind for work in others for kind in work}
@@ -308,6 +310,8 @@ def _never_more(charges: Charges, others: Charges, module: str) -> bool:
         for both in (charges, others)
     )
     half = len(limits) // 2
+    if not all(charges[half:]):
+        return False
     pairs = ((sorted(times[part]), sorted(limits[part])) for part in (slice(half), slice(half, None)))
     return all(time <= limit for mine, theirs in pairs for time, limit in zip(mine, theirs, strict=True))
 
@@ -320,8 +324,11 @@ def warm_charges() -> None:
         _charges_of(planner)
 
 
+_NEXT_TO_NOTHING = {"map_read": 100.0}  # an answer that charges nothing at all has the time assumed of foreign code
+
+
 class _FreeAnswers:
-    """A host of the kit's planner that says that its work took no time."""
+    """A host of the kit's planner that says that its work took next to no time."""
 
     def __init__(self) -> None:
         from robotbrain.pipeline.inherited import cropped_planner
@@ -331,15 +338,15 @@ class _FreeAnswers:
     def show(self, *room: Any) -> dict[str, float]:
         """Publish a map."""
         self._host.show(*room)
-        return {}
+        return _NEXT_TO_NOTHING
 
     def ask(self, start: Point, goal: Point, tolerance: float) -> tuple[Array | None, dict[str, float]]:
-        """Return the answered path, (N, 2) m, and that it cost nothing."""
-        return self._host.ask(start, goal, tolerance)[0], {}
+        """Return the answered path, (N, 2) m, and that it cost next to nothing."""
+        return self._host.ask(start, goal, tolerance)[0], _NEXT_TO_NOTHING
 
 
 def free_planner() -> Any:
-    """Return a planner node that plans like the kit's, in no time."""
+    """Return a planner node that plans like the kit's, in next to no time."""
     return relay(_FreeAnswers())
 
 
