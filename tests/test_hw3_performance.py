@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from robotbrain.errors import InputError
-from robotbrain.grading import Suite, load_hidden_suite
+from robotbrain.grading import CheckFailure, Suite, load_hidden_suite
 from robotbrain.grading.course import find_course, release_differences
 from robotbrain.grading.sample import load_mutants
 from robotbrain.grading.suites import hw3_performance_drives as drives
@@ -285,6 +285,20 @@ def test_a_planner_on_one_thread_that_leads_elsewhere_in_a_room_of_the_brains_si
 
     run = drives.drive_repaired(OneThread(on_one_thread(), make), 1)  # type: ignore[arg-type]
     assert len(counted) == 1 and not run.success
+
+
+def test_a_planner_on_one_thread_that_raises_is_reported_as_its_drive_does(suite: Suite) -> None:
+    def make() -> Any:
+        from robotbrain.pipeline.nodes.planner import PlannerNode
+
+        class Raising(PlannerNode):
+            def _plan(self, request: Any, response: Any) -> Any:
+                raise ValueError("no way")
+
+        return Raising()
+
+    with pytest.raises(CheckFailure, match="the planner raised ValueError on the way"):
+        drives.drive_repaired(OneThread(on_one_thread(), make), 1)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
