@@ -74,10 +74,10 @@ class Standing:
 
 
 class _StudentSession(Session):
-    """A session whose ``commit`` only flushes, as nbgrader commits after each cell; :meth:`finish` commits."""
+    """A session whose ``commit`` waits for :meth:`finish`, as nbgrader commits after each cell."""
 
     def commit(self) -> None:
-        self.flush()
+        """Do nothing: queries and :meth:`finish` write what has changed, all together."""
 
     def finish(self) -> None:
         super().commit()
@@ -168,6 +168,7 @@ class BatchGradebook(Gradebook):  # type: ignore[misc]
         self.update_or_create_student(student)
         when = {} if timestamp is None else {"timestamp": timestamp}
         submission = self.update_or_create_submission(assignment, student, **when)
+        self.db.flush()
         self._load(submission)
         return submission
 
