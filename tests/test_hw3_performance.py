@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 from collections.abc import Callable, Mapping
@@ -27,6 +28,7 @@ from robotbrain.pipeline.inherited import (
     unmet_requirements,
     whole_map_planner,
 )
+from robotbrain.pipeline.nodes.planner import PlannerNode
 from robotbrain.ros import charge_work
 from tests import classes
 
@@ -201,28 +203,39 @@ def on_one_thread(**changes: Any) -> BrainSetup:
     return replace(given, deployment=deployment, **changes)
 
 
-def charging(work: Mapping[str, float], on_map: bool = False) -> Callable[[], Any]:
+class Dear(PlannerNode):
     """A planner that plans like the kit's and charges more."""
 
-    def make() -> Any:
-        from robotbrain.pipeline.nodes.planner import PlannerNode
+    def __init__(self, for_maps: Mapping[str, float], for_answers: Mapping[str, float]) -> None:
+        super().__init__()
+        self.for_maps, self.for_answers = for_maps, for_answers
 
-        class Dear(PlannerNode):
-            def _on_map(self, msg: Any) -> None:
-                super()._on_map(msg)
-                self.charge(on_map)
+    def _on_map(self, msg: Any) -> None:
+        super()._on_map(msg)
+        for kind, units in self.for_maps.items():
+            charge_work(kind, units)
 
-            def _plan(self, request: Any, response: Any) -> Any:
-                self.charge(not on_map)
-                return super()._plan(request, response)
+    def _plan(self, request: Any, response: Any) -> Any:
+        for kind, units in self.for_answers.items():
+            charge_work(kind, units)
+        return super()._plan(request, response)
 
-            def charge(self, now: bool) -> None:
-                for kind, units in work.items() if now else ():
-                    charge_work(kind, units)
 
-        return Dear()
+class Astray(PlannerNode):
+    """A planner that leads half a metre aside in maps of the brain's size."""
 
-    return make
+    def _plan(self, request: Any, response: Any) -> Any:
+        answer = super()._plan(request, response)
+        for pose in answer.plan.poses if self._map is not None and self._map.info.width > 100 else ():
+            pose.pose.position.y += 0.5
+        return answer
+
+
+class Raising(PlannerNode):
+    """A planner that knows no way."""
+
+    def _plan(self, request: Any, response: Any) -> Any:
+        raise ValueError("no way")
 
 
 def test_a_planner_of_ones_own_on_one_thread_drives_wherever_it_decides(
@@ -253,62 +266,47 @@ def test_a_planner_on_one_thread_that_takes_no_longer_than_the_kits_need_not_dri
 
 
 @pytest.mark.parametrize(
-    ("dear", "late"),
+    ("for_maps", "for_answers", "late"),
     [
-        (charging({"astar": 30_000}), True),
-        (charging({"astar": 30_000}, on_map=True), True),
-        (charging({"view": 1}), False),  # of a kind that no planner has
+        ({}, {"astar": 30_000}, True),
+        ({"astar": 30_000}, {}, True),
+        ({}, {"view": 1}, False),  # of a kind that no planner has
     ],
     ids=["answers", "maps", "another-kind"],
 )
 def test_a_planner_on_one_thread_that_takes_longer_drives(
-    suite: Suite, counted: list[BrainSetup], dear: Callable[[], Any], late: bool
+    suite: Suite,
+    counted: list[BrainSetup],
+    for_maps: dict[str, float],
+    for_answers: dict[str, float],
+    late: bool,
 ) -> None:
-    found = drives.drive_repaired(OneThread(on_one_thread(), dear), 1)  # type: ignore[arg-type]
+    student = OneThread(on_one_thread(), functools.partial(Dear, for_maps, for_answers))
+    found = drives.drive_repaired(student, 1)  # type: ignore[arg-type]
     assert len(counted) == 1 and (found.e2e_p95_ms > 1.2 * drives.BUDGET_MS[drives.NANO]) == late
 
 
 def test_a_planner_on_one_thread_that_leads_elsewhere_in_a_room_of_the_brains_size_drives(
     suite: Suite, counted: list[BrainSetup]
 ) -> None:
-    def make() -> Any:
-        from robotbrain.pipeline.nodes.planner import PlannerNode
-
-        class Astray(PlannerNode):
-            def _plan(self, request: Any, response: Any) -> Any:
-                answer = super()._plan(request, response)
-                for pose in answer.plan.poses if self._map.info.width > 100 else ():
-                    pose.pose.position.y += 0.5
-                return answer
-
-        return Astray()
-
-    run = drives.drive_repaired(OneThread(on_one_thread(), make), 1)  # type: ignore[arg-type]
+    run = drives.drive_repaired(OneThread(on_one_thread(), Astray), 1)  # type: ignore[arg-type]
     assert len(counted) == 1 and not run.success
 
 
 def test_a_planner_on_one_thread_that_raises_is_reported_as_its_drive_does(suite: Suite) -> None:
-    def make() -> Any:
-        from robotbrain.pipeline.nodes.planner import PlannerNode
-
-        class Raising(PlannerNode):
-            def _plan(self, request: Any, response: Any) -> Any:
-                raise ValueError("no way")
-
-        return Raising()
-
     with pytest.raises(CheckFailure, match="the planner raised ValueError on the way"):
-        drives.drive_repaired(OneThread(on_one_thread(), make), 1)  # type: ignore[arg-type]
+        drives.drive_repaired(OneThread(on_one_thread(), Raising), 1)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
     "work", [{"astar": math.nan}, {"astar": -1e9, "costmap": 1e9}, {"astar": math.inf}, {"view": 0}]
 )
 def test_charges_that_are_no_charges_are_not_compared(work: dict[str, float]) -> None:
-    fair = [{"astar": 100.0, "costmap": 100.0}] * 2
+    one = {"astar": 100.0, "costmap": 100.0}
+    fair = [one], [one]
     assert drives._never_more(fair, fair, drives.NANO)
-    assert not drives._never_more([work, fair[1]], fair, drives.NANO)
-    assert not drives._never_more([fair[0], work], fair, drives.NANO)
+    assert not drives._never_more(([work], [one]), fair, drives.NANO)
+    assert not drives._never_more(([one], [work]), fair, drives.NANO)
 
 
 def test_requirements_name_what_is_broken() -> None:

@@ -168,17 +168,17 @@ class _Registrar:
         if self._awaited or self._hold:
             return
         try:
-            standings = self._standings(self._here)
+            standings = self._standings()
             self._hold = bool(self._changes(standings))
             if not self._hold:
-                self._enter(self._here, standings)
+                self._enter(standings)
         except Exception:  # what ails the gradebook need not keep the others from being run; at the end it is told
             self._entry.writer.log.exception("entering marks was put off")
             self._hold = True
 
     def changes(self) -> list[Change]:
         """What entering those who are here would change now: somebody may have given marks meanwhile."""
-        return self._changes(self._standings(self._here))
+        return self._changes(self._standings())
 
     def postponed(self) -> tuple[list[str], set[str]]:
         """Whose notebooks the machine failed to run, and who of them keeps the marks they have."""
@@ -189,21 +189,22 @@ class _Registrar:
         """Enter everybody who has not been entered yet; return all who could not be."""
         _, kept = self.postponed()
         self._here += [p for p in self._unsound if p.student not in kept]
-        self._enter(self._here, self._standings(self._here))
+        self._enter(self._standings())
         return self._failed
 
-    def _standings(self, people: Sequence[Person]) -> list[Standing]:
-        return [self._entry.standing(p.student) for p in people]
+    def _standings(self) -> list[Standing]:
+        return [self._entry.standing(p.student) for p in self._here]
 
     def _changes(self, standings: Sequence[Standing]) -> list[Change]:
         found = (self._entry.change(p, s) for p, s in zip(self._here, standings, strict=True))
         return sorted(filter(None, found), key=lambda c: c.student)
 
-    def _enter(self, people: list[Person], standings: Sequence[Standing]) -> None:
+    def _enter(self, standings: Sequence[Standing]) -> None:
         for standing in standings:
-            if not self._entry.enter(people[0], standing):
-                self._failed.append(people[0].student)
-            del people[0]
+            person = self._here[0]
+            if not self._entry.enter(person, standing):
+                self._failed.append(person.student)
+            del self._here[0]  # not before: if this one raises, it is tried again
 
 
 class _Run:

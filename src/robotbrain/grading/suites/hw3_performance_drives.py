@@ -251,29 +251,31 @@ def _known_on_one_thread(
     student: Student, setup: BrainSetup, module: str, world: int, time_limit: float
 ) -> Drive | None:
     """Return the known run that decides over a student's planner on one thread; None if it has to drive itself."""
-    from robotbrain.pipeline.inherited import cropped_planner, whole_map_planner
-
-    budget, known = BUDGET_MS[module or NANO], dict[Callable[[], Any], Drive]()
-    for planner in (cropped_planner, whole_map_planner, free_planner):
-        key = key_of(replace(setup, planner=planner), world, time_limit)
-        if key in KNOWN:
-            known[planner] = KNOWN[key]
+    keys = {p: key_of(replace(setup, planner=p), world, time_limit) for p in (*_kits_planners(), free_planner)}
+    known = {planner: KNOWN[key] for planner, key in keys.items() if key in KNOWN}
+    budget = BUDGET_MS[module or NANO]
     best = min(known.values(), key=lambda run: run.e2e_p95_ms, default=None)
-    if best and len(known) == 3 and best.e2e_p95_ms > SPREAD * HALF_BUDGETS * budget:
+    if best and known.keys() == keys.keys() and best.e2e_p95_ms > SPREAD * HALF_BUDGETS * budget:
         return best
-    good = {p: run for p, run in known.items() if run.success and SPREAD * run.e2e_p95_ms <= budget}
-    good.pop(free_planner, None)  # nobody charges less
+    likely = {p: known[p] for p in _kits_planners() if p in known}
+    good = {p: run for p, run in likely.items() if run.success and SPREAD * run.e2e_p95_ms <= budget}
     if not good:
         return None
     try:
         charged = _charges(PlannerBench(student.run(host_repaired, module)))
-        return next((run for kits, run in good.items() if _never_more(charged, _charges_of(kits), setup.module)), None)
+        return next((run for p, run in good.items() if _never_more(charged, _charges_of(p), setup.module)), None)
     except Exception:  # whatever is wrong with this planner, its own drive shows
         return None
 
 
-Charges = list[dict[str, float]]
-"""What a planner charged for each of some maps, and then for each answer, by kind of work."""
+def _kits_planners() -> tuple[Callable[[], Any], ...]:
+    from robotbrain.pipeline.inherited import cropped_planner, whole_map_planner
+
+    return cropped_planner, whole_map_planner
+
+
+Charges = tuple[list[dict[str, float]], list[dict[str, float]]]
+"""What a planner charged for some maps, each, and for its answers, by kind of work."""
 
 
 def _charges(bench: PlannerBench) -> Charges:
@@ -287,7 +289,7 @@ def _charges(bench: PlannerBench) -> Charges:
         shown.append(bench.show(room))
         check_path(bench.ask(start, goal, tolerance=0.4), room, start, goal)
         answered.append(bench.work)
-    return shown + answered
+    return shown, answered
 
 
 @functools.cache
@@ -302,25 +304,24 @@ def _never_more(charges: Charges, others: Charges, module: str) -> bool:
     """
     from robotbrain.jetson import load_profile
 
-    profile, kinds = load_profile(module), {kind for work in others for kind in work}
-    if not all(kind in kinds and 0.0 <= units < math.inf for work in charges for kind, units in work.items()):
+    profile, kinds = load_profile(module), {kind for works in others for work in works for kind in work}
+
+    def times(works: list[dict[str, float]]) -> list[int]:
+        return sorted(sum(profile.work_ns(kind, units) for kind, units in work.items()) for work in works)
+
+    charged = [pair for works in charges for work in works for pair in work.items()]
+    if not all(kind in kinds and 0.0 <= units < math.inf for kind, units in charged) or not all(charges[1]):
         return False
-    times, limits = (
-        [sum(profile.work_ns(kind, units) for kind, units in work.items()) for work in both]
-        for both in (charges, others)
+    return all(
+        time <= limit
+        for mine, theirs in zip(charges, others, strict=True)
+        for time, limit in zip(times(mine), times(theirs), strict=True)
     )
-    half = len(limits) // 2
-    if not all(charges[half:]):
-        return False
-    pairs = ((sorted(times[part]), sorted(limits[part])) for part in (slice(half), slice(half, None)))
-    return all(time <= limit for mine, theirs in pairs for time, limit in zip(mine, theirs, strict=True))
 
 
 def warm_charges() -> None:
     """Find out what the kit's planners charge, once for all students."""
-    from robotbrain.pipeline.inherited import cropped_planner, whole_map_planner
-
-    for planner in (cropped_planner, whole_map_planner):
+    for planner in _kits_planners():
         _charges_of(planner)
 
 
